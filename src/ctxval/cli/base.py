@@ -40,7 +40,7 @@ FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED, CUT_OFF = 1, 2, 3, 130, 141
 
 RUN = "run"  #: key under which a store keeps the verdict of its last run and the report that was written
 
-ERROR = ("error: ", "bold red")
+ERROR, COLOURS = ("error: ", "bold red"), {"validated": "green", "falsified": "red", "undecided": "yellow"}
 
 out, notes, err = Screen(), Screen(stderr=True), Screen(stderr=True)
 """What ``--json`` silences, on stdout and on stderr, and what is always said, on stderr."""
@@ -311,8 +311,8 @@ def print_other_stores(others: list[str]) -> None:
 
 
 def print_verdict(verdict: Verdict, units: str = "") -> None:
-    colour = {"validated": "green", "falsified": "red", "undecided": "yellow"}[verdict.answer]
     threshold = f"{verdict.threshold:g} {units}".rstrip()
+    colour = COLOURS[verdict.answer]
     out.say((verdict.answer.upper(), f"bold {colour}"), f" against {threshold}: {verdict.reason}", wrap=True)
     if verdict.rests_on is not None:
         out.say(verdict.rests_on, wrap=True)

@@ -347,8 +347,7 @@ def named_model(text: str, options: Mapping[str, Any], dt: float | None = None) 
     elif path.suffix == ".xml" or is_sysid_result(path):
         table = {"type": "MuJoCo", "mjcf": text, "dt": dt}
     elif ":" not in text and text not in REGISTRY.built_in and text not in REGISTRY.installed:
-        raise InputError(
-            f"a model must be a file that ends in .onnx, .npz, .xml or .toml, a result of mujoco.sysid, module:attr, "
-            f"or one of {', '.join(REGISTRY.built_in)}, got {text!r}."
-        )
+        files = "a file that ends in .onnx, .npz, .xml or .toml, a result of mujoco.sysid"
+        known = f"module:attr, or one of {', '.join(REGISTRY.built_in)}"
+        raise InputError(f"a model must be {files}, {known}, got {text!r}.")
     return as_model(part("model", {**table, **options}))

@@ -20,7 +20,7 @@ from ctxval.cli import base
 from ctxval.cli.base import command, err, named_values, out, print_table
 from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of
-from ctxval.cli.stores import page_path, print_envelope
+from ctxval.cli.stores import print_envelope
 from ctxval.core.trajectory import Transitions
 from ctxval.core.trial import designs_sentence
 from ctxval.errors import CertificateError, InputError
@@ -75,10 +75,9 @@ def run(
     parts = experiment.validation
     data = getattr(parts.model, "data", None)
     learned = f" from {len(data)} transitions" if isinstance(data, Transitions) and len(data) else ""
-    sentence = f": S {type(parts.system).__name__}, M {type(parts.model).__name__}{learned}, "
-    sentence += f"controllers {type(parts.synthesizer).__name__}"
-    if limit is not None:
-        sentence += f", threshold {limit:g} {units}".rstrip()
+    system, model, synthesizer = (type(each).__name__ for each in (parts.system, parts.model, parts.synthesizer))
+    against = "" if limit is None else f", threshold {limit:g} {units}".rstrip()
+    sentence = f": S {system}, M {model}{learned}, controllers {synthesizer}{against}"
     out.say((experiment.name, "bold"), sentence, wrap=True)
     with _live_page(live, ServedCampaign(experiment, campaign, limit, certificate, total), settings) as shown:
         take = None if shown is None else shown.take
@@ -119,7 +118,7 @@ def run(
             report |= {"truth": found, "error_percent": missed}
         result = {"verdict": None if verdict is None else verdict.to_json(), "budget": total}
         if with_report:
-            page = page_path(path)
+            page = path.with_suffix(".report.html")
             # An earlier run may have written the same report.
             current = page.is_file() and campaign.store.computed(base.RUN) == {**result, "report": str(page)}
             try:

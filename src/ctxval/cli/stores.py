@@ -173,7 +173,7 @@ def write_report(
     force: bool = False,
 ) -> Any:
     opened = Store.existing(store)
-    target = page_path(store) if page is None else page
+    target = store.with_suffix(".report.html") if page is None else page
     outputs = {"--out .html": target, "--junit .xml": junit, "--markdown .md": markdown}
     base.require_outputs(outputs, [store, allowed.experiment], force=force)
     require("threshold", PositiveFloat | None, asked.threshold)
@@ -201,10 +201,6 @@ def write_report(
     if context.missing:
         out.say(f"without the experiment: {context.missing}", wrap=True)
     return {**reports.to_json(context), "files": written}, base.status_of(context.verdict)
-
-
-def page_path(store: Path) -> Path:
-    return store.with_suffix(".report.html")
 
 
 @command("envelope")

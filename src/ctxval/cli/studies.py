@@ -73,10 +73,7 @@ def compare(
 
 
 def _candidates(texts: Sequence[str], folder: Path, seed: int, options: dict[str, Any]) -> dict[str, Campaign]:
-    """Return the campaigns of the candidates. A refused comparison leaves no store that a later one would find.
-
-    The name of a candidate is the one that is given, or else the text without folder and suffix.
-    """
+    """Return the campaigns of the candidates. A refused comparison leaves no store that a later one would find."""
     settings: dict[str, Settings] = {}
     for text in texts:
         before, equals, after = text.partition("=")
@@ -260,14 +257,11 @@ def _has_another_margin(path: Path, settings: Settings) -> bool:
 
 
 def _print_safety(report: SafetyReport, drawn: DrawnTasks | None) -> None:
-    units = report.units
-
-    def of(value: float | None, before: str = "") -> str:
-        return "unknown" if value is None else f"{before}{value:.4g} {units}".rstrip()
+    def of(value: float | None) -> str:
+        return "unknown" if value is None else f"{value:.4g} {report.units}".rstrip()
 
     if report.answer is not None and report.margin is not None:
-        colour = {"validated": "green", "falsified": "red", "undecided": "yellow"}[report.answer]
-        out.say((report.answer.upper(), f"bold {colour}"), f": margin {of(report.margin)}")
+        out.say((report.answer.upper(), f"bold {base.COLOURS[report.answer]}"), f": margin {of(report.margin)}")
     out.say(report.statement[0].upper() + report.statement[1:], wrap=True)
     executed, predicted = "largest executed", "predicted to be at most"
     certified = "not certified" if report.d_b_bound is None else f"certified at most {of(report.d_b_bound)}"

@@ -63,11 +63,9 @@ def read_mat(path: Path) -> list[Log]:
 
 
 def _version_7_3(path: Path) -> dict[str, Any]:
-    """Return the recordings of ControlDesk in an HDF5 file, or its numeric arrays, after everything in it is checked.
-
-    HDF5 lets a file name others: by links, as the storage of a data set, and as the source of a virtual one. A
-    stranger's file would name any file of the user. MATLAB writes none of these.
-    """
+    """Return the recordings of ControlDesk in an HDF5 file, or its numeric arrays, after all in it is checked."""
+    # HDF5 lets a file name others, such as any of the user: by links, as the storage of a data set, and as the source
+    # of a virtual one. MATLAB writes none of these.
     h5py = require_extra("h5py", "logs", "MATLAB files of version 7.3 need")
     checked, numeric, size = dict[str, Any](), list[str](), 0
     with h5py.File(path, "r") as file:
@@ -236,11 +234,7 @@ class ControlDeskLog(Log):
 
 
 def is_control_desk(structure: Any) -> bool:
-    """Return whether a structure is a recording of ControlDesk: it has times, and signals with names and numbers.
-
-    X and Y are mappings, or lists of them, with arrays of numbers as ``Data`` and texts as ``Name``, ``Unit`` and
-    ``Raster``.
-    """
+    """Return whether a structure is a recording of ControlDesk: it has times, and signals with names and numbers."""
     is_mapping = isinstance(structure, Mapping)
     return is_mapping and any(_numbers(x).size for x in _elements(structure, "X")) and bool(_named(structure))
 
@@ -250,6 +244,7 @@ def _named(structure: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def _elements(structure: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
+    """Return X or Y, a mapping or a list of them: numbers as ``Data``, texts as ``Name``, ``Unit`` and ``Raster``."""
     value = structure.get(name)
     given = [value] if isinstance(value, Mapping) else value
     return [part for part in given if isinstance(part, Mapping)] if isinstance(given, list | np.ndarray) else []

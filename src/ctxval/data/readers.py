@@ -53,10 +53,8 @@ def read_npz(path: Path) -> list[Log]:
     if inputs.ndim != 3 or len(inputs) != len(states):
         given, wanted = f"states {states.shape} and inputs {inputs.shape}", "(batch, H + 1, n) and (batch, H, m)"
         raise InputError(f"{path} cannot be read: {given} are not those of one batch of trajectories, {wanted}.")
-    return [
-        MemoryTable(f"{path}, trajectory {k}", {"times": times, "states": x, "inputs": u})
-        for k, (x, u) in enumerate(zip(states, inputs, strict=True))
-    ]
+    runs = enumerate(zip(states, inputs, strict=True))
+    return [MemoryTable(f"{path}, trajectory {k}", {"times": times, "states": x, "inputs": u}) for k, (x, u) in runs]
 
 
 # Parquet
@@ -132,9 +130,8 @@ def component_names(paths: Sequence[str | Path]) -> Mapping[str, list[str]]:
 def read_json_records(path: Path) -> list[Log]:
     """Return the log in a JSON file: a list of records, or an object with one list of records.
 
-    A field of a record is a number, true or false, or a list of numbers; ``name.part`` is one of an object in it. What
-    is missing or null in a record is NaN. Numbers beside the list, such as a gain, hold for all records. Files that end
-    in ``.gz`` are decompressed.
+    A field is a number, true or false, or a list of numbers; ``name.part`` is one of an object in a record. What is
+    missing or null is NaN. Numbers beside the list, such as a gain, hold for all records.
     """
     packed = read_bytes(path)
     with reworded(f"{path} cannot be read as JSON", OSError, EOFError, zlib.error, ValueError, RecursionError):

@@ -23,10 +23,8 @@ from ctxval.data import LogMapping, read_recordings
 from ctxval.errors import InputError
 from ctxval.models.saved import stored_transitions
 
-REGISTRIES: dict[str, Registry[Any]] = {
-    registry.kind: registry
-    for registry in (systems.REGISTRY, models.REGISTRY, controllers.REGISTRY, distances.REGISTRY)
-}
+_REGISTRIES = (systems.REGISTRY, models.REGISTRY, controllers.REGISTRY, distances.REGISTRY)
+REGISTRIES: dict[str, Registry[Any]] = {registry.kind: registry for registry in _REGISTRIES}
 """Where the parts that an experiment file describes are found, by the name of their table."""
 
 
@@ -178,12 +176,9 @@ def require_types(what: str, function: Any, options: Mapping[str, Any]) -> dict[
 def with_distribution(
     space: TaskSpace, tables: Mapping[str, Mapping[str, Any]], folder: Path | None = None
 ) -> TaskSpace:
-    """Return a task space with the distribution of tasks of an experiment file.
-
-    The tables are, for each parameter, ``{type = "normal", mean = ..., deviation = ...}``, ``{type = "uniform"}`` or
-    ``{ref = "module:attr"}`` of a frozen distribution of scipy.stats; or only ``sampler``, the reference of a function
-    ``(rng, n) -> tasks (n, d)``.
-    """
+    """Return a task space with a distribution of tasks: ``sampler`` alone, or one of each parameter."""
+    # The former is the reference of a function (rng, n) -> tasks (n, d), and the latter normal, uniform, or one of a
+    # frozen distribution of scipy.stats.
     if set(tables) == {"sampler"} and set(tables["sampler"]) == {"ref"} and "sampler" not in space.names:
         return space.sampled(argument(tables["sampler"], folder))
     for name in tables:

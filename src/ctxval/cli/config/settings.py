@@ -37,22 +37,16 @@ Part = str | dict[str, Any]  #: ``module:attr``, or a table with a type and its 
 
 
 class CertificateTable(BaseModel, extra="allow"):
-    """The table ``[certificate]``: the certificate for the verdict, chosen before the campaign is run.
-
-    A kind of certificate from another package has its own options in the table.
-    """
+    """The table ``[certificate]``, chosen before a campaign; a kind from another package has its own options in it."""
 
     kind: str = "auto"
-    #: the share of the task space that may exceed the threshold
-    volume: float = Field(default=0.0, ge=0, le=MOST_VOLUME, strict=True)
-    #: the number of executions that must have been predicted beforehand at tasks drawn over the task space
-    tests: int = Field(default=TESTS, ge=0, strict=True)
+    volume: float = Field(default=0.0, ge=0, le=MOST_VOLUME, strict=True)  #: of the tasks above the threshold
+    tests: int = Field(default=TESTS, ge=0, strict=True)  #: executions at drawn tasks, predicted beforehand
     #: the share of the executions of each task that the verdict is about, if they differ by noise
     quantile: float = Field(default=QUANTILE, ge=0.5, lt=1, strict=True)
     #: the largest distance between a task and its nearest trial, in diagonals of the task space
     resolution: float = Field(default=RESOLUTION, gt=0, allow_inf_nan=False, strict=True)
-    #: the number of largest distances to discard, for ``sampling-discarding``
-    discard: int | None = Field(default=None, ge=0)
+    discard: int | None = Field(default=None, ge=0)  #: the largest distances, for ``sampling-discarding``
 
     @model_validator(mode="after")
     def _used(self) -> CertificateTable:
@@ -94,25 +88,18 @@ class SearchTable(BaseModel, extra="allow"):
 
 
 class Aspect1Table(BaseModel, extra="forbid"):
-    """The table ``[aspect1]``, which ``ctxval check --aspect1`` reads; a campaign does not use it.
+    """The table ``[aspect1]``, which ``ctxval check --aspect1`` reads; a campaign does not use it."""
 
-    The distance tells how far a trajectory is from completing its task; by default it is derived from that of the
-    experiment. The threshold is in the units of the goal.
-    """
-
-    distance: Part | None = None
-    threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
+    distance: Part | None = None  #: how far a trajectory is from completing its task; None to derive it
+    threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)  #: in the goal's units
     tasks: int = Field(default=TASKS, ge=2)
 
 
 class SpecTable(BaseModel, extra="allow"):
-    """The table ``[spec]``: what a closed loop shall do, which ``ctxval safe`` judges.
-
-    Its other entries are the arguments of the specification. The margin is the robustness of M that shall suffice for a
-    task to be safe; None to find it.
-    """
+    """The table ``[spec]``: what a closed loop shall do, with the arguments of the specification as other entries."""
 
     type: str = "ReachAvoid"
+    #: the robustness of M that shall suffice for a task to be safe; None to find it
     margin: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
 
     def on(self, experiment: Experiment) -> Experiment:
@@ -124,17 +111,13 @@ _WHOLE = ("space", "task", "system", "model", "synthesizer")
 
 
 class Settings(BaseModel, extra="forbid"):
-    """The content of an experiment file, overridden by the options of the command line.
+    """The content of an experiment file, overridden by the options of the command line."""
 
-    Either ``experiment`` names the experiment, or ``name`` to ``units`` describe it completely.
-    """
-
-    experiment: str | None = None
+    experiment: str | None = None  #: names the experiment; otherwise ``name`` to ``units`` describe it completely
     options: dict[str, Any] = Field(default_factory=dict)
     name: str | None = None
     space: dict[str, list[Any]] | None = None
-    #: the parameters of each task by its name, in the place of the space, if tasks are a list
-    suite: dict[str, dict[str, float | str]] | None = None
+    suite: dict[str, dict[str, float | str]] | None = None  #: tasks by name, in the place of the space
     #: see :func:`~ctxval.cli.config.parts.with_distribution`; a named experiment may have one too
     distribution: dict[str, dict[str, Any]] | None = None
     task: Part | None = None
@@ -148,10 +131,8 @@ class Settings(BaseModel, extra="forbid"):
     budget: int | None = Field(default=None, ge=1)
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
     longest: int | None = Field(default=None, ge=1, strict=True)
-    #: the task parameters that change the dynamics of the system; a named experiment may have some too
-    physical: list[str] | None = None
-    #: the indices of M's states that are recorded, or the function ``module:attr`` of them
-    outputs: str | list[int] | None = None
+    physical: list[str] | None = None  #: the task parameters that change the dynamics, also of a named experiment
+    outputs: str | list[int] | None = None  #: the indices of M's states that are recorded, or a function of them
     explore: bool | None = None  #: as the options of ``ctxval run``, so that a store knows the command that made it
     within: float = Field(default=WITHIN, gt=0, allow_inf_nan=False, strict=True)
     confidence: float = Field(default=CONFIDENCE, ge=LEAST_CONFIDENCE, lt=1, strict=True)
@@ -161,13 +142,10 @@ class Settings(BaseModel, extra="forbid"):
     search: SearchTable = Field(default_factory=SearchTable)
     aspect1: Aspect1Table = Field(default_factory=Aspect1Table)
     spec: SpecTable | None = None
-    #: whether the distance is judged or, as by ``ctxval safe``, the specification
-    judge: Literal["distance", "spec"] = "distance"
-    #: the file of a model that `ctxval refine` has learned from executions; it replaces the given model
-    refined: Path | None = None
+    judge: Literal["distance", "spec"] = "distance"  #: ``ctxval safe`` judges the specification
+    refined: Path | None = None  #: the file of a model by `ctxval refine`, which replaces the given model
     recordings: dict[str, Any] | None = None
-    #: the folder of modules and files, which is that of the experiment file; None for the current folder
-    folder: Path | None = None
+    folder: Path | None = None  #: that of modules and files, as of the experiment file; None for the current one
     file: str | None = None  #: the name of the experiment file, for the commands that reports state
 
     def load(self) -> Experiment:
@@ -224,12 +202,8 @@ class Settings(BaseModel, extra="forbid"):
         if self.spec is not None:  # d_a, of the states that the specification looks at
             default = {"type": "MaximumDeviation", "components": (self.spec.model_extra or {}).get("components")}
         task = parts.task_function(self.task or {}, space, system, self.folder)
-        tables = {
-            "model": self.model or {},
-            "synthesizer": self.synthesizer or {},
-            "distance": self.distance or default,
-        }
-        made = {kind: part(kind, table, self.folder) for kind, table in tables.items()}
+        tables = {"model": self.model, "synthesizer": self.synthesizer, "distance": self.distance or default}
+        made = {kind: part(kind, table or {}, self.folder) for kind, table in tables.items()}
         labels = Labels(labels_of(self.states), labels_of(self.inputs), self.units or "")
         validation = Validation(space=space, task=task, system=system, labels=labels, outputs=outputs, **made)
         if isinstance(task, parts.TaskTable):

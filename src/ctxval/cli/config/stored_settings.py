@@ -24,10 +24,7 @@ from ctxval.errors import InputError
 
 
 def planned_settings(store: Store, kind: str | None = None) -> Settings:
-    """Return the settings in a store, whoever wrote them; the defaults if no command made the store.
-
-    Do not build anything from them: :func:`trusted_settings` returns those that may be used.
-    """
+    """Return the settings in a store, whoever wrote them, from which nothing may be built; the defaults if none."""
     kept = store.settings()
     if not kept:
         return Settings()
