@@ -1,10 +1,14 @@
 """The command line: a thin skin over the public interface."""
 
-from ctxval.cli.commands import app, print_anything
+import sys
+
+from ctxval.cli.commands import app
 
 __all__ = ["app", "main"]
 
 
 def main() -> None:
-    print_anything()
+    for stream in (sys.stdout, sys.stderr):  # they escape the characters that their encoding does not have
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
     app(prog_name="ctxval")

@@ -19,29 +19,28 @@ from typing import Annotated, Any, TypeVar
 import typer
 from rich.table import Table
 
+from ctxval import Trial, Verdict, searches
 from ctxval._util.describe import describe
 from ctxval._util.files import make_folder_of, require_made_by_us
 from ctxval._util.progress import progress_shown
 from ctxval._util.refusals import reworded
+from ctxval._util.representation import counted
 from ctxval._util.texts import reason_of, shortened
 from ctxval.campaign.goals_of_model import GoalWarning
 from ctxval.campaign.storage.disks import StoreWarning
 from ctxval.certificates import KINDS
 from ctxval.certificates.bounds import as_text
-from ctxval.certificates.verdict import Verdict
 from ctxval.cli.commands import TEXTS, Screen, app, line
 from ctxval.core.experiment import UnitsWarning
 from ctxval.core.plan import DistanceWarning
-from ctxval.core.trial import Trial
 from ctxval.core.validation import CostWarning
 from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
-from ctxval.searches import REGISTRY as SEARCHES
 
 FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED, CUT_OFF = 1, 2, 3, 130, 141
 
 RUN = "run"  #: key under which a store keeps the verdict of its last run and the report that was written
 
-ERROR = ("error: ", "bold red")
+ERROR, COLOURS = ("error: ", "bold red"), {"validated": "green", "falsified": "red", "undecided": "yellow"}
 
 out, notes, err = Screen(), Screen(stderr=True), Screen(stderr=True)
 """What ``--json`` silences, on stdout and on stderr, and what is always said, on stderr."""
@@ -69,9 +68,7 @@ def command(name: str | None = None, /, *, with_json: bool = True, **words: Any)
                 groups[parameter.name] = group, [each.name for each in options]
             parameters += options
         if with_json:
-            parameters.append(
-                inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=bool)
-            )
+            parameters += [inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=bool)]
 
         @functools.wraps(function)
         def wrapped(*, as_json: bool = False, **given: Any) -> None:
@@ -94,13 +91,10 @@ def _described(parameter: inspect.Parameter, command: str, words: Mapping[str, A
     text = {**TEXTS["options"], **TEXTS.get(command, {})}[parameter.name]
     # The text itself names the kinds that most people need.
     kinds = (kind for kind in KINDS.built_in if kind not in ("auto", "posterior", "audit"))
-    searches = ", ".join(sorted(SEARCHES.built_in))
-    target = "CASE|FILE.toml|module:attr"
-    words = {**words, "target": target, "searches": searches, "certificates": ", ".join(kinds)}
-    known: dict[str, Any] = {
-        key: value.format(**words) if isinstance(value, str) else value
-        for key, value in ({"help": text} if isinstance(text, str) else text).items()
-    }
+    words = {**words, "searches": ", ".join(sorted(searches.REGISTRY.built_in)), "certificates": ", ".join(kinds)}
+    words["target"] = "CASE|FILE.toml|module:attr"
+    known: dict[str, Any] = {"help": text} if isinstance(text, str) else text
+    known = {key: value.format(**words) if isinstance(value, str) else value for key, value in known.items()}
     if "argument" in known:
         info: Any = typer.Argument(metavar=known.pop("argument"), **known)
     else:
@@ -144,9 +138,7 @@ def _run(function: Callable[[], Any], as_json: bool, stated: set[str]) -> None:
         if as_json:
             try:
                 print(dumps({"error": failure}), flush=True)
-            except OSError as error:
-                # What is still buffered must not fail again at the exit of the interpreter, which would change the
-                # status.
+            except OSError as error:  # what is still buffered must not fail again at exit, and change the status
                 with suppress(io.UnsupportedOperation, OSError, ValueError):
                     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 if isinstance(error, BrokenPipeError):
@@ -225,10 +217,9 @@ def require_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[object]
     for option, path in outputs.items():
         if path is None:
             continue
-        name, _, suffix = option.partition(" .")
-        suffix = suffix and f".{suffix}"
-        if suffix and path.suffix.lower() != suffix:
-            raise InputError(f"{name} must be a file that ends in {suffix}, got {str(path)!r}.")
+        name, has_suffix, suffix = option.partition(" .")
+        if has_suffix and path.suffix.lower() != f".{suffix}":
+            raise InputError(f"{name} must be a file that ends in .{suffix}, got {str(path)!r}.")
         make_folder_of(path)
         with reworded(f"{path} cannot be written", OSError, RuntimeError, ValueError):
             place, there = path.resolve(), path.exists()
@@ -238,11 +229,10 @@ def require_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[object]
         named[place] = name
         if path.is_dir():
             raise InputError(f"{path} cannot be written: it is a folder.")
-        if is_input and not force:
-            raise InputError(f"{path} is read by this command: give another name, or --force to replace it.")
-        if path.is_symlink() and not force:
-            raise InputError(f"{path} is a link to another file: give another name, or --force to replace it.")
         if not force:
+            if is_input or path.is_symlink():
+                what = "read by this command" if is_input else "a link to another file"
+                raise InputError(f"{path} is {what}: give another name, or --force to replace it.")
             require_made_by_us(path)
 
 
@@ -289,14 +279,13 @@ def print_table(rows: dict[str, Any], units: str = "") -> None:
     """Print a table of names and values, of which a value may be a task with its distance."""
     table = Table(show_header=False, box=None, pad_edge=False)
     for key, value in rows.items():
+        text = as_text(value) or "none"
         match value:
             case {"task": dict() as task, "distance": distance, **rest}:
                 # All digits: the task that is typed again must be the one that was executed.
                 at = ", ".join(f"{name} = {item}" for name, item in task.items())
                 how = f" ({rest['method']})" if "method" in rest else ""
                 text = f"{f'{distance:.4g} {units}'.rstrip()} at {at}{how}"
-            case _:
-                text = as_text(value) or "none"
         table.add_row(line(key.replace("_", " ")), line(text))
     out.print(table)
 
@@ -316,14 +305,14 @@ def print_columns(columns: Sequence[str], rows: Iterable[Sequence[str]], title: 
 
 def print_other_stores(others: list[str]) -> None:
     if others:
-        count = f"{len(others)} other store{'s' if len(others) > 1 else ''} of this experiment"
-        sentence = f"the folder contains {count}: {', '.join(others)}."
-        out.say(f"{sentence} The best result of several campaigns is wrong more often than its confidence states.")
+        stores = f"{counted(len(others), 'other store')} of this experiment: {', '.join(others)}"
+        why = "The best result of several campaigns is wrong more often than its confidence states."
+        out.say(f"the folder contains {stores}. {why}")
 
 
 def print_verdict(verdict: Verdict, units: str = "") -> None:
-    colour = {"validated": "green", "falsified": "red", "undecided": "yellow"}[verdict.answer]
     threshold = f"{verdict.threshold:g} {units}".rstrip()
+    colour = COLOURS[verdict.answer]
     out.say((verdict.answer.upper(), f"bold {colour}"), f" against {threshold}: {verdict.reason}", wrap=True)
     if verdict.rests_on is not None:
         out.say(verdict.rests_on, wrap=True)

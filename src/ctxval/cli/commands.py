@@ -1,13 +1,8 @@
-"""The commands, which module has each, and the screens that they print on.
-
-A module is loaded when one of its commands is called.
-The help of ``ctxval`` lists the commands without loading any of them, so their first sentences stand among the texts.
-"""
+"""The commands, the module of each, which is loaded when one of them is called, and the screens that they print on."""
 
 from __future__ import annotations
 
 import importlib
-import sys
 import tomllib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -25,11 +20,7 @@ from ctxval._util.version import VERSION
 
 
 class Screen(Console):
-    """A console that prints texts literally.
-
-    Everything that rich prints is rendered here. Control characters are therefore escaped in lines, in tables and in
-    progress bars alike.
-    """
+    """A console that prints texts literally; it escapes control characters in all that rich renders."""
 
     def __init__(self, *, stderr: bool = False) -> None:
         super().__init__(stderr=stderr, markup=False, emoji=False, highlight=False)
@@ -50,18 +41,11 @@ def line(text: str) -> str:
     return visible(shortened(text).replace("\r\n", "\n")).replace("\n", "\n  ")
 
 
-def print_anything() -> None:
-    """Let the standard streams escape the characters that their encoding does not have."""
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")
-
-
 TEXTS: dict[str, Any] = tomllib.loads(Path(__file__).with_name("texts.toml").read_text("utf-8"))
 """Every text of the command line."""
 
 PANELS: dict[str, dict[str, list[str]]] = TEXTS["groups"]
-"""For each group of the help, in order: the commands, the module of each, and the paragraphs of its help."""
+"""For each group of the help, in order: the commands, the module of each, and the paragraphs, so none is loaded."""
 
 MODULES = {name: f"ctxval.cli.{module}" for names in PANELS.values() for name, (module, *_) in names.items()}
 """The module of each command."""

@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+from ctxval import Plan, Store
 from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.progress import advance, stage
 from ctxval._util.refusals import require_extra
@@ -14,13 +15,11 @@ from ctxval._util.texts import enumerated
 from ctxval.campaign import by_hand
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
-from ctxval.campaign.storage.store import Store
 from ctxval.campaign.telling import SuppliedResult
 from ctxval.cli.base import Allowed, command, named_values, out, print_verdict, require_folder, status_of
 from ctxval.cli.config.settings import Settings
 from ctxval.cli.config.stored_settings import Opened, budget_of, limit_of, open_store, open_target, trusted_settings
 from ctxval.core.exchange import TASK_FORMAT
-from ctxval.core.plan import Plan
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import InputError
 from ctxval.web.jobs import ServedCampaign
@@ -96,26 +95,18 @@ def ask(
     out.say(f"trial {waiting.number}: {task}")
     out.say(f"{', '.join(files)} in {folder}")
     if "controller.json" not in files:
-        out.say(
-            "the controller cannot be written to a file: this is possible only for affine feedback (LQR and iLQR). Run "
-            f"its loop in Python: `plan = campaign.reopen({waiting.number}).plan`, then `pi = controllers.started("
-            "plan.controller, plan.task)` and `u = pi(t, x)` at each step."
-        )
+        plan = f"`plan = campaign.reopen({waiting.number}).plan`"
+        steps = "`pi = controllers.started(plan.controller, plan.task)` and `u = pi(t, x)` at each step"
+        why = "the controller cannot be written to a file: this is possible only for affine feedback (LQR and iLQR)."
+        out.say(f"{why} Run its loop in Python: {plan}, then {steps}.")
     if (waiting.trial.note or {}).get(CONVERGED) is False:
         out.say("the design of the controller did not converge: nearly the same task may have another controller.")
     if others:
         trials = "trial is" if len(others) == 1 else "trials are"
         out.say(f"{len(others)} other {trials} open: {enumerated(others, 10)}.")
     out.say(f"next: ctxval tell {shlex.quote(str(path))} {waiting.number} --trajectory run.csv")
-    return {
-        "trial": waiting.number,
-        "task": waiting.trial.parameters,
-        "origin": waiting.trial.origin,
-        "store": str(path),
-        "folder": str(folder),
-        "files": files,
-        "open": others,
-    }
+    report = {"trial": waiting.number, "task": waiting.trial.parameters, "origin": waiting.trial.origin}
+    return {**report, "store": str(path), "folder": str(folder), "files": files, "open": others}
 
 
 @command()
@@ -141,12 +132,11 @@ def tell(
         raise InputError("--resample and --start-tolerance need a recording: give --trajectory or --npz.")
     require("start tolerance", NonNegativeFloat | None, start_tolerance)
     opened = open_store(store, allowed)
-    campaign, file, mapping = opened.campaign, trajectory or npz, opened.settings.log_mapping
+    file, mapping = trajectory or npz, opened.settings.log_mapping
     result = SuppliedResult(file, distance, failed, npz is not None, resample, start_tolerance, mapping, replace)
-    ended = by_hand.tell_result(campaign, opened.experiment, trial, result)
-    differences = campaign.start_offset(ended), campaign.input_difference(ended)
-    out.say(by_hand.result_sentence(ended, opened.experiment.units, *differences))
-    return _ended(ended, campaign.executions, store)
+    ended = by_hand.tell_result(opened.campaign, opened.experiment, trial, result)
+    _say_result(opened, ended)
+    return _ended(opened, ended)
 
 
 @command("import")
@@ -160,39 +150,35 @@ def import_runs(
 ) -> Any:
     require("start tolerance", NonNegativeFloat | None, start_tolerance)
     opened = open_store(store, allowed)
-    campaign, experiment, mapping = opened.campaign, opened.experiment, opened.settings.log_mapping
-    space = experiment.validation.space
+    campaign, space = opened.campaign, opened.experiment.validation.space
     given = by_hand.parameters_from(parameters, space) if parameters else None
-    how = {"resample": resample, "start_tolerance": start_tolerance, "mapping": mapping}
+    how = {"resample": resample, "start_tolerance": start_tolerance, "mapping": opened.settings.log_mapping}
     runs = by_hand.read_runs(files, given, space, **how)
     checked = list[tuple[Plan, Execution]]()
     with stage("checking", len(runs), "runs"):
         for run in runs:  # all of them before any is stored
-            checked.append(run.checked(campaign.validation, experiment))
+            checked.append(run.checked(campaign.validation, opened.experiment))
             advance(1)
     ended = campaign.recorder.add(checked, _WAIT)
     new = [trial for trial in ended if trial is not None]
     known = len(ended) - len(new)
     for trial in new[:10]:
-        differences = campaign.start_offset(trial), campaign.input_difference(trial)
-        out.say(by_hand.result_sentence(trial, experiment.units, *differences))
+        _say_result(opened, trial)
     if len(new) > 10:
         out.say(f"... and {len(new) - 10} other trials; --json lists them.")
     out.say(f"{len(new)} runs imported, {known} already in the store.")
-    imported = [_ended(trial, campaign.executions, store) for trial in new]
-    return {"imported": imported, "known": known, "store": str(store)}
+    return {"imported": [_ended(opened, trial) for trial in new], "known": known, "store": str(store)}
 
 
-def _ended(trial: Trial, executions: int, store: Path) -> dict[str, Any]:
-    return {
-        "trial": trial.number,
-        "task": trial.parameters,
-        "state": trial.state,
-        "distance": trial.distance,
-        "failure": trial.failure,
-        "executions": executions,
-        "store": str(store),
-    }
+def _say_result(opened: Opened, trial: Trial) -> None:
+    differences = opened.campaign.start_offset(trial), opened.campaign.input_difference(trial)
+    out.say(by_hand.result_sentence(trial, opened.experiment.units, *differences))
+
+
+def _ended(opened: Opened, trial: Trial) -> dict[str, Any]:
+    result = {"state": trial.state, "distance": trial.distance, "failure": trial.failure}
+    store = {"executions": opened.campaign.executions, "store": str(opened.path)}
+    return {"trial": trial.number, "task": trial.parameters, **result, **store}
 
 
 @command(with_json=False)
@@ -209,9 +195,6 @@ def serve(
     web = require_extra("ctxval.web.server", "web", "the page needs")
     settings = trusted_settings(Store.existing(store), experiment=allowed.experiment, trust=allowed.trust)
 
-    def first() -> ServedCampaign:
-        return _served(open_store(store, allowed), threshold, budget)
-
     def say_started(place: str, secret: str | None) -> None:
         out.say(f"the page is at {place}" + ("" if secret is None else f"?token={secret}"))
         if secret is not None:
@@ -219,7 +202,8 @@ def serve(
         out.say("Ctrl-C stops the server; all results are stored.")
 
     again = functools.partial(_reopened, settings, store, threshold, budget)  # a child process unpickles it
-    web.serve(first, again, say_started, host=host, port=port, token=token, names=allow_host or ())
+    where: dict[str, Any] = {"host": host, "port": port, "token": token, "names": allow_host or ()}
+    web.serve(lambda: _served(open_store(store, allowed), threshold, budget), again, say_started, **where)
 
 
 def _reopened(settings: Settings, path: Path, threshold: float | None, budget: int | None) -> ServedCampaign:

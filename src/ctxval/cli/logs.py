@@ -22,7 +22,7 @@ from ctxval.campaign.choices import Execution
 from ctxval.campaign.watching import FALSE_ALARMS
 from ctxval.cli.base import FALSIFIED, Allowed, command, notes, out, print_columns, require_outputs
 from ctxval.cli.config.stored_settings import Opened, limit_of, open_store
-from ctxval.cli.recordings import Logs, error_cells, print_breaks
+from ctxval.cli.recordings import Logs, print_breaks, print_errors
 from ctxval.core.trajectory import Trajectory
 from ctxval.data import Field, LogMapping, Observer
 from ctxval.errors import ExecutionError, InputError
@@ -48,17 +48,15 @@ def watch(
     opened = open_store(store, allowed)
     limit = limit_of(opened.experiment, opened.settings, threshold)
     if limit is None:
-        raise InputError(
-            "a threshold is needed: give --threshold, because neither the store nor the experiment has one."
-        )
+        why = "neither the store nor the experiment has one"
+        raise InputError(f"a threshold is needed: give --threshold, because {why}.")
     how = {"resample": resample, "start_tolerance": start_tolerance}
     runs = list(_runs(opened, logs, reading, parameters, how))  # all are read before any is judged
     watching = opened.campaign.watch(limit, false_alarms)
     judged, skipped = list[dict[str, Any]](), list[dict[str, str]]()
     if resample:
-        notes.say(
-            "--resample interpolates: steps with missing samples are no steps of the system, and look like a change."
-        )
+        missing = "steps with missing samples are no steps of the system, and look like a change"
+        notes.say(f"--resample interpolates: {missing}.")
     with stage("judging", len(runs), "runs"):
         for name, execution, task in runs:
             try:
@@ -93,28 +91,20 @@ def watch(
         out.say(f"execute again: trial {trial.number}, {task_text(trial.parameters)}")
     if again:
         out.say(f"next: {_next(opened, allowed, store, limit, again[0].number)}")
-    report = {
-        "runs": judged,
-        "skipped": skipped,
-        "again": [{"trial": trial.number, "task": trial.parameters} for trial in again],
-        "watch": state.to_json(),
-        "store": str(store),
-    }
+    repeated = [{"trial": trial.number, "task": trial.parameters} for trial in again]
+    report = {"runs": judged, "skipped": skipped, "again": repeated, "watch": state.to_json(), "store": str(store)}
     return report, FALSIFIED if state.expired else 0
 
 
 def _next(opened: Opened, allowed: Allowed, store: Path, threshold: float, trial: int) -> str:
-    """Return the command that goes on after an alarm.
-
-    People execute a trial again. A system that is executed is validated as it is now: in another store, because the
-    executions of this one are those of the system before.
-    """
+    """Return the command that goes on after an alarm."""
     by_people = getattr(opened.experiment.validation.system, "manual", False)
     if by_people or any(each.told for each in opened.campaign.trials):
         return shlex.join(["ctxval", "ask", str(store), "--again", str(trial), "--because", "REASON"])
     settings, target = opened.settings.model_copy(update={"threshold": threshold}), allowed.experiment or ""
     if not target and settings.file is not None and settings.folder not in (None, Path.cwd()):
         target = str(Path(settings.folder or "", settings.file))
+    # In another store, because the executions of this one are those of the system before.
     other = store.with_name(f"{store.stem}.changed{store.suffix}")
     return run_command(settings.model_dump(mode="json"), settings.budget, "--store", str(other), target=target)
 
@@ -127,11 +117,10 @@ def _runs(
     opened: Opened, logs: Sequence[Path], reading: Logs, parameters: list[str] | None, how: Mapping[str, Any]
 ) -> Iterator[_Run]:
     """Yield the runs in tables, in a trajectory whose task is given, and in recordings whose tasks are unknown."""
-    experiment, validation = opened.experiment, opened.campaign.validation
+    validation, space = opened.campaign.validation, opened.campaign.validation.space
     mapping = reading.stated() or opened.settings.log_mapping
     if mapping is not None:
         mapping = replace(mapping, **reading.changes)
-    space = validation.space
     given = parameters_from(parameters, space) if parameters else None
     if given is not None and len(logs) != 1:
         raise InputError(f"--set gives the parameters of one trajectory, got {len(logs)} files.")
@@ -143,7 +132,7 @@ def _runs(
             continue
         for run in read_runs([path], given, space, mapping=mapping, **how):
             try:
-                _, execution = run.checked(validation, experiment)
+                _, execution = run.checked(validation, opened.experiment)
             except ExecutionError as error:
                 execution = Execution(failed=str(error))
             yield run.where, execution, run.parameters
@@ -159,8 +148,7 @@ def _without_task(opened: Opened, path: Path, reading: Logs) -> Iterator[_Run]:
         name = str(path) if len(recordings.runs) == 1 else f"{path}, recording {number + 1}"
         pieces = max(1, whole.horizon // task.horizon)
         if 2 * whole.horizon < task.horizon:
-            short = f"it has {whole.horizon} steps, and a task has {task.horizon}"
-            yield name, Execution(failed=short), None
+            yield name, Execution(failed=f"it has {whole.horizon} steps, and a task has {task.horizon}"), None
             continue
         for piece in range(pieces):
             first, last = piece * task.horizon, min((piece + 1) * task.horizon, whole.horizon)
@@ -194,24 +182,18 @@ def _print_survey(result: Survey) -> None:
     recordings = result.recordings
     steps = f"{recordings.steps} steps of {recordings.dt:g} s"
     out.say(f"{len(result.sources)} logs, {len(recordings.runs)} recordings, {steps}")
-    rows = [
-        (
-            field.path,
-            field.role or "-",
-            f"{field.period:.3g} s" if field.period else "-",
-            f"{field.low:.4g} to {f'{field.high:.4g} {field.unit}'.rstrip()}" if field.records else "-",
-            field.remark,
-        )
-        for field in result.fields[:24]
-    ]
+    rows = []
+    for field in result.fields[:24]:
+        every = f"{field.period:.3g} s" if field.period else "-"
+        values = f"{field.low:.4g} to {f'{field.high:.4g} {field.unit}'.rstrip()}" if field.records else "-"
+        rows.append((field.path, field.role or "-", every, values, field.remark))
     print_columns(["field", "taken as", "every", "values", "remark"], rows, "fields of the logs", left=2)
     if len(result.fields) > 24:
         out.say(f"and {len(result.fields) - 24} other fields; --json lists them.")
     for guess in result.guesses:
         out.say(("guessed: ", "yellow"), guess, wrap=True)
     print_breaks(recordings)
-    errors = [(model.kind, *error_cells(each)) for model in result.fit.fitted for each in model.errors]
-    print_columns(["model", "state", "steps", "rms error", "of the change"], errors, "error on others", left=2)
+    print_errors(result.fit.fitted, "error on others")
     out.say("")
     for sentence in result.replay.insights:
         out.say(("- ", "bold"), sentence, wrap=True)

@@ -23,7 +23,7 @@ from ctxval.errors import ExecutionError, InputError
 from ctxval.models import REGISTRY, read_model
 from ctxval.models.mujoco import is_sysid_result
 from ctxval.report.replay_page import write_replay_page
-from ctxval.studies.fitting import FitReport, FittedParameter, fit
+from ctxval.studies.fitting import FitReport, FittedModel, FittedParameter, fit
 from ctxval.studies.fitting.excitation import Excitation, SignalKind
 from ctxval.studies.fitting.fit import HOLD_OUT, KINDS
 from ctxval.studies.fitting.fit import STEPS as FITTED
@@ -85,16 +85,10 @@ class Logs:
             states, inputs = experiment.names(*map(len, known.values())) if known["states"] else ({}, {})
         recordings = read_recordings(logs, mapping, states=states, inputs=inputs, **self.changes)
         same = (len(states), len(inputs)) == (len(recordings.states), len(recordings.inputs))
-        if not same or states.keys() & inputs.keys():
-            return recordings
-        units = zip(
-            [*recordings.states.values(), *recordings.inputs.values()],
-            [*states.values(), *inputs.values()],
-            strict=True,
-        )
-        if any(unit not in ("", known) for unit, known in units):
-            return recordings
-        return replace(recordings, states=states, inputs=inputs)
+        known_units = [*states.values(), *inputs.values()]
+        units = [*recordings.states.values(), *recordings.inputs.values()]
+        agree = same and all(unit in ("", known) for unit, known in zip(units, known_units, strict=True))
+        return replace(recordings, states=states, inputs=inputs) if agree and not states.keys() & inputs else recordings
 
 
 def _with_observer(mapping: LogMapping, folder: Path | None) -> LogMapping:
@@ -151,14 +145,9 @@ def replay(
         chosen, name = loaded.validation.model, loaded.name
     else:
         raise InputError("a model is needed: give --model, or --experiment for the model of an experiment.")
-    report = compared(
-        chosen,
-        recordings,
-        steps=REPLAYED if steps is None else numbers(steps),
-        validation=None if loaded is None else loaded.validation.with_parts(model=chosen),
-        executions=executions,
-        seed=seed,
-    )
+    wanted = REPLAYED if steps is None else numbers(steps)
+    validation = None if loaded is None else loaded.validation.with_parts(model=chosen)
+    report = compared(chosen, recordings, steps=wanted, validation=validation, executions=executions, seed=seed)
     units = "" if loaded is None else loaded.units
     _print_replay(report, recordings, units)
     if html is None:
@@ -174,22 +163,16 @@ def _print_replay(report: ReplayReport, recordings: Recordings, units: str) -> N
     out.say(f"{data.recordings} recordings, {data.steps} steps of {data.dt:g} s ({data.steps * data.dt:.4g} s)")
     out.say(f"states: {', '.join(data.states)}; inputs: {', '.join(data.inputs) or 'none'}")
     print_breaks(recordings)
-    rows = [
-        (*error_cells(each), f"{each.lowest:.3g} to {each.highest:.3g}", f"{each.upper:.3g}")
-        for each in sorted(report.errors, key=lambda error: list(data.states).index(error.state))
-    ]
+    errors = sorted(report.errors, key=lambda error: list(data.states).index(error.state))
+    rows = [(*error_cells(each), f"{each.lowest:.3g} to {each.highest:.3g}", f"{each.upper:.3g}") for each in errors]
     columns = ["state", "steps", "rms error", "of the change", "of recordings", "95 % below"]
     print_columns(columns, rows, "error of the prediction")
     if report.residuals:
-        residuals = [
-            (
-                each.state,
-                f"{each.rms:.3g} {each.unit}".rstrip(),
-                *(f"{100 * share:.0f} %" for share in (each.explained, each.linear, each.history)),
-                f"{each.rest:.3g} {each.unit}".rstrip(),
-            )
-            for each in report.residuals
-        ]
+        residuals = []
+        for each in report.residuals:
+            rms, rest = (f"{value:.3g} {each.unit}".rstrip() for value in (each.rms, each.rest))
+            shares = (f"{100 * share:.0f} %" for share in (each.explained, each.linear, each.history))
+            residuals.append((each.state, rms, *shares, rest))
         columns = ["state", "rms", "explained by (x, u)", "affine part", "explained by the step before", "rest"]
         print_columns(columns, residuals, "one-step residual on held-out recordings")
     if report.tasks is not None:
@@ -201,6 +184,15 @@ def _print_replay(report: ReplayReport, recordings: Recordings, units: str) -> N
     out.say("")
     for sentence in report.insights:
         out.say(("- ", "bold"), sentence, wrap=True)
+
+
+def print_errors(models: Sequence[FittedModel], title: str, states: Sequence[str] = ()) -> None:
+    """Print the errors of models; those of each in the order of the states, if it is given."""
+    rows = []
+    for model in models:
+        errors = sorted(model.errors, key=lambda error: states.index(error.state) if states else 0)
+        rows += [(model.kind, *error_cells(each)) for each in errors]
+    print_columns(("model", "state", "steps", "rms error", "of the change"), rows, title, left=2)
 
 
 def error_cells(error: Any) -> tuple[str, ...]:
@@ -238,17 +230,10 @@ def fit_models(
     bounds = function.bounds
     require_model_file(out_, [*logs, reading.mapping, given], force=force)
     recordings = reading.read(logs)
-    report = fit(
-        recordings,
-        [name.strip() for name in kinds],
-        step=function.load(),
-        bounds=bounds,
-        vectorized=function.vectorized,
-        given=None if given is None else named_model(given, {}, recordings.dt),
-        hold_out=hold_out,
-        steps=FITTED if steps is None else numbers(steps),
-        seed=seed,
-    )
+    how: dict[str, Any] = {"step": function.load(), "bounds": bounds, "vectorized": function.vectorized, "seed": seed}
+    how["given"] = None if given is None else named_model(given, {}, recordings.dt)
+    how |= {"hold_out": hold_out, "steps": FITTED if steps is None else numbers(steps)}
+    report = fit(recordings, [name.strip() for name in kinds], **how)
     print_breaks(recordings)
     _print_fit(report)
     if not report.fitted:
@@ -258,10 +243,8 @@ def fit_models(
     if out_ is not None:
         holds = [model for model in learned if isinstance(model.model, SUFFIXES[out_.suffix])]
         if not holds:
-            kinds_learned = ", ".join(model.kind for model in report.fitted)
-            raise InputError(
-                f"no model that was learned ({kinds_learned}) can be written to a file that ends in {out_.suffix}."
-            )
+            tried = f"no model that was learned ({', '.join(model.kind for model in report.fitted)})"
+            raise InputError(f"{tried} can be written to a file that ends in {out_.suffix}.")
         best = holds[0]
         written = write_model_file(out_, best.model, function.step)
         out.say(f"the {best.kind} model is in {' and '.join(written)}")
@@ -287,18 +270,9 @@ def print_parameters(parameters: Sequence[FittedParameter]) -> None:
 
 def _print_fit(report: FitReport) -> None:
     held, learned = report.held_out, report.learned_from
-    out.say(
-        f"learned from {learned.steps} steps of {len(learned.runs)} recordings; errors on {held.steps} steps of "
-        f"{len(held.runs)} others"
-    )
-    order = list(held.states).index
-    rows = [
-        (model.kind, *error_cells(each))
-        for model in report.fitted
-        for each in sorted(model.errors, key=lambda error: order(error.state))
-    ]
-    columns = ("model", "state", "steps", "rms error", "of the change")
-    print_columns(columns, rows, "error on held-out recordings", left=2)
+    errors_on = f"errors on {held.steps} steps of {len(held.runs)} others"
+    out.say(f"learned from {learned.steps} steps of {len(learned.runs)} recordings; {errors_on}")
+    print_errors(report.fitted, "error on held-out recordings", list(held.states))
     for model in report.fitted:
         print_parameters(model.parameters)
         for note in model.notes:
@@ -373,8 +347,7 @@ def named_model(text: str, options: Mapping[str, Any], dt: float | None = None) 
     elif path.suffix == ".xml" or is_sysid_result(path):
         table = {"type": "MuJoCo", "mjcf": text, "dt": dt}
     elif ":" not in text and text not in REGISTRY.built_in and text not in REGISTRY.installed:
-        raise InputError(
-            f"a model must be a file that ends in .onnx, .npz, .xml or .toml, a result of mujoco.sysid, module:attr, "
-            f"or one of {', '.join(REGISTRY.built_in)}, got {text!r}."
-        )
+        files = "a file that ends in .onnx, .npz, .xml or .toml, a result of mujoco.sysid"
+        known = f"module:attr, or one of {', '.join(REGISTRY.built_in)}"
+        raise InputError(f"a model must be {files}, {known}, got {text!r}.")
     return as_model(part("model", {**table, **options}))

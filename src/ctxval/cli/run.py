@@ -20,12 +20,11 @@ from ctxval.cli import base
 from ctxval.cli.base import command, err, named_values, out, print_table
 from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of
-from ctxval.cli.stores import page_path, print_envelope
+from ctxval.cli.stores import print_envelope
 from ctxval.core.trajectory import Transitions
 from ctxval.core.trial import designs_sentence
 from ctxval.errors import CertificateError, InputError
-from ctxval.report.context import context_of_campaign
-from ctxval.report.page import write_page
+from ctxval.report import context_of_campaign, write_page
 from ctxval.web.jobs import ServedCampaign
 
 if TYPE_CHECKING:
@@ -59,10 +58,9 @@ def run(
 ) -> Any:
     stated: dict[str, Any] = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence}
     stated |= {"seed": seed, "explore": explore, "within": within, "store": store, "options": named_values(option)}
-    certified = {"resolution": resolution, "tests": tests, "quantile": quantile}
-    settings = read_settings(target, stated).certified_as(certified)
-    experiment = settings.load()
-    certificate = settings.certificate_options
+    settings = read_settings(target, stated)
+    settings = settings.certified_as({"resolution": resolution, "tests": tests, "quantile": quantile})
+    experiment, certificate = settings.load(), settings.certificate_options
     if truth and experiment.truth is None:
         who = "Only experiments with a `truth` function have it, such as the cases of the paper"
         raise InputError(f"the true maximum of {experiment.name!r} is not known. {who}.")
@@ -77,25 +75,16 @@ def run(
     parts = experiment.validation
     data = getattr(parts.model, "data", None)
     learned = f" from {len(data)} transitions" if isinstance(data, Transitions) and len(data) else ""
-    sentence = f": S {type(parts.system).__name__}, M {type(parts.model).__name__}{learned}, "
-    sentence += f"controllers {type(parts.synthesizer).__name__}"
-    if limit is not None:
-        sentence += f", threshold {limit:g} {units}".rstrip()
+    system, model, synthesizer = (type(each).__name__ for each in (parts.system, parts.model, parts.synthesizer))
+    against = "" if limit is None else f", threshold {limit:g} {units}".rstrip()
+    sentence = f": S {system}, M {model}{learned}, controllers {synthesizer}{against}"
     out.say((experiment.name, "bold"), sentence, wrap=True)
     with _live_page(live, ServedCampaign(experiment, campaign, limit, certificate, total), settings) as shown:
+        take = None if shown is None else shown.take
+        how: dict[str, Any] = {"explore": settings.explores, "envelope": envelope, "within": settings.within}
+        how |= {"certificate": certificate, "timeout": timeout, "again": again_failed}
         with _workers(workers, dask) as execution:
-            campaign.run(
-                total,
-                limit,
-                None if shown is None else shown.take,
-                explore=settings.explores,
-                envelope=envelope,
-                within=settings.within,
-                certificate=certificate,
-                timeout=timeout,
-                again=again_failed,
-                **execution,
-            )
+            campaign.run(total, limit, take, **how, **execution)
         known = experiment.truth() if truth and experiment.truth is not None else None
         digest = campaign.store.digest()
         verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
@@ -106,36 +95,30 @@ def run(
         if verdict is None and not settings.explores:
             with suppress(CertificateError):
                 bound = campaign.certify(certificate=certificate)
-        estimate, expected = campaign.estimate, None if verdict is None else verdict.expected
-        report: dict[str, Any] = {
-            "case": experiment.name,
-            **({"options": settings.options} if settings.options else {}),
-            "search": settings.search.name,
-            "seed": settings.seed,
-            "budget": total,
-            "executions": campaign.executions,
-            "failed": len(campaign.failed),
-            "failures": base.failures_of(campaign.failed),
-            "controllers": designs_sentence(campaign.trials),
-            "worst": base.worst_of(campaign.worst),
-            "estimate": estimate,
-            "interval": None if campaign.worst is None else [campaign.worst.distance, bound and bound.bound],
-            "units": units,
-            **(dict.fromkeys(("verdict", "reason", "rests_on", "threshold")) if verdict is None else verdict.to_json()),
-            "certificate": None if bound is None else bound.to_json(),
-            **({} if trusted is None else {"envelope": trusted.to_json()}),
-            "expected": None if expected is None else asdict(expected),
-            "store": str(path),
-            "other_stores": [str(other.path) for other in other_stores(path)],
-        }
+        worst, estimate, expected = campaign.worst, campaign.estimate, None if verdict is None else verdict.expected
+        report: dict[str, Any] = {"case": experiment.name}
+        if settings.options:
+            report["options"] = settings.options
+        report |= {"search": settings.search.name, "seed": settings.seed, "budget": total}
+        report |= {"executions": campaign.executions, "failed": len(campaign.failed)}
+        report |= {"failures": base.failures_of(campaign.failed), "controllers": designs_sentence(campaign.trials)}
+        interval = None if worst is None else [worst.distance, bound and bound.bound]
+        report |= {"worst": base.worst_of(worst), "estimate": estimate, "interval": interval, "units": units}
+        without = dict.fromkeys(("verdict", "reason", "rests_on", "threshold"))
+        report |= without if verdict is None else verdict.to_json()
+        report["certificate"] = None if bound is None else bound.to_json()
+        if trusted is not None:
+            report["envelope"] = trusted.to_json()
+        report |= {"expected": None if expected is None else asdict(expected), "store": str(path)}
+        report["other_stores"] = [str(other.path) for other in other_stores(path)]
         if known is not None:
             task = campaign.validation.space.describe_point(known.parameters.points)
-            report["truth"] = {"distance": known.distance, "task": task, "method": known.method}
             missed = None if estimate is None else 100 * (known.distance - estimate) / known.distance
-            report["error_percent"] = missed
+            found = {"distance": known.distance, "task": task, "method": known.method}
+            report |= {"truth": found, "error_percent": missed}
         result = {"verdict": None if verdict is None else verdict.to_json(), "budget": total}
         if with_report:
-            page = page_path(path)
+            page = path.with_suffix(".report.html")
             # An earlier run may have written the same report.
             current = page.is_file() and campaign.store.computed(base.RUN) == {**result, "report": str(page)}
             try:
@@ -163,11 +146,8 @@ def run(
     if verdict is not None:
         base.print_other_stores(report["other_stores"])
     if campaign.failed and not campaign.completed:
-        err.say(
-            base.ERROR,
-            f"all {len(campaign.failed)} executions failed, so there is no distance. `ctxval why` looks for a "
-            "cause in what was recorded before the failures.",
-        )
+        why = "`ctxval why` looks for a cause in what was recorded before the failures."
+        err.say(base.ERROR, f"all {len(campaign.failed)} executions failed, so there is no distance. {why}")
         return report, base.CANNOT_GO_ON
     return report, base.status_of(verdict)
 

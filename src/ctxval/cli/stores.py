@@ -38,22 +38,16 @@ def status(store: Path) -> Any:
         case {"verdict": {"verdict": str(answer), "threshold": float(threshold), "reason": str(reason)}}:
             verdict = f"{answer} against {threshold:g}: {reason}"
     search = description.get("search")
+    search = search.get("type") if isinstance(search, dict) else None
+    states = ("failed", "unmeasured", "open")
+    numbers = {state: [trial.number for trial in trials if trial.state == state] for state in states}
     measured = [trial for trial in trials if trial.distance is not None]
-    report: dict[str, Any] = {
-        "case": description.get("name"),
-        "search": search.get("type") if isinstance(search, dict) else None,
-        "seed": description.get("seed"),
-        "executions": sum(trial.executed for trial in trials),
-        "failed": sum(trial.state == "failed" for trial in trials),
-        "failures": base.failures_of(trials),
-        "unmeasured": [trial.number for trial in trials if trial.state == "unmeasured"],
-        "open": [trial.number for trial in trials if trial.state == "open"],
-        "worst": base.worst_of(max(measured, key=lambda trial: trial.distance or 0, default=None)),
-        "verdict": verdict,
-        "thresholds": thresholds,
-        "changes": [asdict(change) for change in changes],
-        "store": str(store),
-    }
+    worst = base.worst_of(max(measured, key=lambda trial: trial.distance or 0, default=None))
+    report: dict[str, Any] = {"case": description.get("name"), "search": search, "seed": description.get("seed")}
+    report |= {"executions": sum(trial.executed for trial in trials), "failed": len(numbers["failed"])}
+    report |= {"failures": base.failures_of(trials), "unmeasured": numbers["unmeasured"], "open": numbers["open"]}
+    report |= {"worst": worst, "verdict": verdict, "thresholds": thresholds}
+    report |= {"changes": [asdict(change) for change in changes], "store": str(store)}
     print_table({key: value for key, value in report.items() if key not in ("failures", "thresholds", "changes")})
     for stated in thresholds:
         known = counted(stated["distances"], "known distance")
@@ -85,25 +79,22 @@ def export_store(store: Path, out_: Path | None = None, force: bool = False) -> 
 def remeasure(store: Path, allowed: Allowed) -> Any:
     before = {trial.number: trial.distance for trial in Store.existing(store).trials()}
     campaign = open_store(store, allowed, remeasure=True).campaign
-    trials = campaign.trials
-    report: dict[str, Any] = {
-        "measured": sum(trial.state == "completed" for trial in trials),
-        "changed": [trial.number for trial in trials if trial.distance != before.get(trial.number)],
-        "unmeasured": [trial.number for trial in campaign.unmeasured],
-        "worst": base.worst_of(campaign.worst),
-        "store": str(store),
-    }
-    if report["changed"]:
-        count = f"{len(report['changed'])} of {report['measured']}"
+    trials, worst = campaign.trials, base.worst_of(campaign.worst)
+    measured = sum(trial.state == "completed" for trial in trials)
+    changed = [trial.number for trial in trials if trial.distance != before.get(trial.number)]
+    unmeasured = [trial.number for trial in campaign.unmeasured]
+    if changed:
+        count = f"{len(changed)} of {measured}"
         out.say(f"{count} distances have changed. The history of the store keeps the earlier values.")
     else:
         file = "If an experiment file defines the distance, name the file with --experiment."
         out.say(f"no distance has changed. {file}")
-    if report["unmeasured"]:
-        out.say(f"trials without a distance: {', '.join(map(str, report['unmeasured']))}.")
-    if report["worst"] is not None:
-        print_table({"largest distance": report["worst"]})
-    return report
+    if unmeasured:
+        out.say(f"trials without a distance: {', '.join(map(str, unmeasured))}.")
+    if worst is not None:
+        print_table({"largest distance": worst})
+    counts = {"measured": measured, "changed": changed, "unmeasured": unmeasured}
+    return {**counts, "worst": worst, "store": str(store)}
 
 
 @dataclass(frozen=True)
@@ -121,8 +112,7 @@ class Asked:
     option: list[str] | None = None
 
     def options(self, settings: Settings, kind: str | None) -> CertificateOptions:
-        names = ("discard", "volume", "resolution", "tests", "quantile")
-        given = {name: getattr(self, name) for name in names}
+        given = {name: getattr(self, name) for name in ("discard", "volume", "resolution", "tests", "quantile")}
         level = settings.confidence if self.confidence is None else self.confidence
         return settings.certificate.options(level, kind=kind, stated=named_values(self.option, **given))
 
@@ -135,9 +125,8 @@ def certify_store(store: Path, asked: Asked, allowed: Allowed, audit: int | None
         kind = "posterior" if kind == "auto" else kind  # auto would load the experiment, so it must be asked for
     loads = audit is not None or KINDS.find(kind).needs_model
     if not loads and (allowed.trust or allowed.experiment is not None):
-        raise InputError(
-            "--trust and --experiment need --audit or a kind that uses the model: otherwise no code is imported or run."
-        )
+        why = "otherwise no code is imported or run"
+        raise InputError(f"--trust and --experiment need --audit or a kind that uses the model: {why}.")
     if loads:
         settings = trusted_settings(opened, experiment=allowed.experiment, trust=allowed.trust)
     else:
@@ -166,11 +155,9 @@ def certify_store(store: Path, asked: Asked, allowed: Allowed, audit: int | None
         head, colon, rest = row.partition(":")
         out.say((head, "bold red" if head == "withdrawn" else ""), f"{colon}{rest}", wrap=True)
     if asked.kind is None and kind == "posterior":  # the verdict of the campaign may differ
-        out.say(
-            "the campaign was run with the kind auto, which may decide earlier. It loads the experiment, so it must be "
-            f"asked for: `ctxval certify {shlex.quote(str(store))} --kind auto`.",
-            wrap=True,
-        )
+        auto = "the campaign was run with the kind auto, which may decide earlier."
+        how = f"`ctxval certify {shlex.quote(str(store))} --kind auto`"
+        out.say(f"{auto} It loads the experiment, so it must be asked for: {how}.", wrap=True)
     base.print_other_stores(others)
     return {**assessment.to_json(), "store": str(store), "other_stores": others}, base.status_of(verdict)
 
@@ -186,7 +173,7 @@ def write_report(
     force: bool = False,
 ) -> Any:
     opened = Store.existing(store)
-    target = page_path(store) if page is None else page
+    target = store.with_suffix(".report.html") if page is None else page
     outputs = {"--out .html": target, "--junit .xml": junit, "--markdown .md": markdown}
     base.require_outputs(outputs, [store, allowed.experiment], force=force)
     require("threshold", PositiveFloat | None, asked.threshold)
@@ -202,13 +189,9 @@ def write_report(
         known: dict[str, Any] = {"missing": str(error), "labels": labels, "budget": settings.budget}
         context = reports.context_of_store(opened, limit, certificate=asked.options(settings, asked.kind), **known)
     else:
-        settings, experiment = loaded.settings, loaded.experiment
-        context = reports.context_of_campaign(
-            loaded.campaign,
-            threshold=limit_of(experiment, settings, asked.threshold),
-            certificate=asked.options(settings, asked.kind),
-            budget=budget_of(experiment, settings),
-        )
+        settings, limit = loaded.settings, limit_of(loaded.experiment, loaded.settings, asked.threshold)
+        options, budget = asked.options(settings, asked.kind), budget_of(loaded.experiment, settings)
+        context = reports.context_of_campaign(loaded.campaign, threshold=limit, certificate=options, budget=budget)
     written = {"report": str(reports.write_page(context, target))}
     if junit is not None:
         written["junit"] = str(write_text(junit, reports.junit(context)))
@@ -218,10 +201,6 @@ def write_report(
     if context.missing:
         out.say(f"without the experiment: {context.missing}", wrap=True)
     return {**reports.to_json(context), "files": written}, base.status_of(context.verdict)
-
-
-def page_path(store: Path) -> Path:
-    return store.with_suffix(".report.html")
 
 
 @command("envelope")
@@ -275,10 +254,7 @@ def why(store: Path, allowed: Allowed, most: int = 2) -> Any:
     out.say((causes.sentence, "bold" if causes.named else ""), wrap=True)
     if causes.separating_sentence is not None:
         out.say(causes.separating_sentence, wrap=True)
-    if causes.python is not None:
-        out.say("")
-        for row in causes.python.splitlines():
-            out.say(row)
-    for row in causes.mjcf:
+    rows = [] if causes.python is None else ["", *causes.python.splitlines()]
+    for row in (*rows, *causes.mjcf):
         out.say(row)
     return {**causes.to_json(), "store": str(store)}

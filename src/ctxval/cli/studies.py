@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ctxval import Campaign, Store, Validation, plot
 from ctxval._util.checked import PositiveFloat, PositiveInt, require
 from ctxval._util.files import write_text
 from ctxval._util.representation import task_text
 from ctxval._util.texts import enumerated, reason_of
-from ctxval.campaign import plot
-from ctxval.campaign.campaign import Campaign
-from ctxval.campaign.storage.store import Store
 from ctxval.certificates import CertificateOptions
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.cli import base
@@ -23,7 +22,6 @@ from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of, open_target
 from ctxval.cli.recordings import StepFunction, print_parameters, require_model_file
-from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
 from ctxval.specs import ReachAvoid
 from ctxval.studies.comparison import compare as run_comparison
@@ -55,15 +53,10 @@ def compare(
     picture = None if out_ is None else out_.with_suffix(".png")
     require_outputs({"--out .md": out_, "its picture": picture}, candidates, force=force)
     campaigns = _candidates(candidates, stores, seed, named_values(option))
-    comparison = run_comparison(
-        campaigns,
-        question=question,  # type: ignore[arg-type]  # it refuses other words
-        budget=budget,
-        confidence=CONFIDENCE if confidence is None else confidence,
-        seed=seed,
-        largest_possible=largest_possible,
-        stochastic=stochastic,
-    )
+    how: dict[str, Any] = {"question": question, "budget": budget, "seed": seed}  # it refuses other questions
+    how |= {"confidence": CONFIDENCE if confidence is None else confidence}
+    how |= {"largest_possible": largest_possible, "stochastic": stochastic}
+    comparison = run_comparison(campaigns, **how)
     failures = {name: base.failures_of(campaign.failed) for name, campaign in campaigns.items()}
     _print_comparison(comparison)
     for value in failures.values():
@@ -80,10 +73,7 @@ def compare(
 
 
 def _candidates(texts: Sequence[str], folder: Path, seed: int, options: dict[str, Any]) -> dict[str, Campaign]:
-    """Return the campaigns of the candidates. A refused comparison leaves no store that a later one would find.
-
-    The name of a candidate is the one that is given, or else the text without folder and suffix.
-    """
+    """Return the campaigns of the candidates. A refused comparison leaves no store that a later one would find."""
     settings: dict[str, Settings] = {}
     for text in texts:
         before, equals, after = text.partition("=")
@@ -112,11 +102,8 @@ def _print_comparison(comparison: Comparison) -> None:
     for pair in comparison.pairs:
         out.say(f"{pair.first}, {pair.second}: {pair.reason}.", wrap=True)
     units = f" The distances are in {comparison.units}." if comparison.units else ""
-    out.say(
-        f"{comparison.executions} executions of at most {comparison.budget}. All decisions hold together with "
-        f"confidence {comparison.confidence:.6g}.{units} They assume that",
-        wrap=True,
-    )
+    together = f"All decisions hold together with confidence {comparison.confidence:.6g}.{units} They assume that"
+    out.say(f"{comparison.executions} executions of at most {comparison.budget}. {together}", wrap=True)
     for assumption in comparison.assumptions:
         out.say(f"- {assumption};", wrap=True)
 
@@ -161,16 +148,8 @@ def refine_model(
         experiment = replace(opened.experiment, validation=validation, truth=None)
         return settings.model_copy(update=known).campaign(experiment, store)
 
-    refinement = refine(
-        opened.campaign,
-        limit,
-        budget,
-        method=chosen,
-        certificate=settings.certificate_options,
-        open_round=open_round,
-        workers=workers,
-        timeout=timeout,
-    )
+    how: dict[str, Any] = {"method": chosen, "certificate": settings.certificate_options, "open_round": open_round}
+    refinement = refine(opened.campaign, limit, budget, workers=workers, timeout=timeout, **how)
     _print_refinement(refinement)  # before the files are written, which may fail
     number = refinement.last.number
     files = [] if out_ is None or not number else write_refined(out_, refinement, function.step)
@@ -198,8 +177,7 @@ def _method(name: str, fit: str | None, function: StepFunction) -> Method | None
 
 def _print_refinement(refinement: Refinement) -> None:
     rows = [(*each.cells, each.store.name if each.store else "-") for each in refinement.rounds]
-    columns = (*refinement.head, "store")
-    print_columns(columns, rows, left=len(columns))
+    print_columns((*refinement.head, "store"), rows, left=len(refinement.head) + 1)
     for each in refinement.rounds:
         for note in each.notes:
             out.say((f"round {each.number}: ", "bold"), note, wrap=True)
@@ -244,9 +222,8 @@ def safe(
     if audit is not None:
         require_box(experiment.validation)
     share = require_safe_tasks(experiment.validation)
-    campaign = settings.campaign(
-        experiment, path, accept_change=accept_change, remeasure=_has_another_margin(path, settings)
-    )
+    again = _has_another_margin(path, settings)
+    campaign = settings.campaign(experiment, path, accept_change=accept_change, remeasure=again)
     total, certificate = budget_of(experiment, settings), settings.certificate_options
     units, wanted = experiment.units, f"{100 * share:.0f} % of the drawn tasks satisfy the specification on the model"
     if table.margin is not None:
@@ -269,35 +246,27 @@ def safe(
 
 def _has_another_margin(path: Path, settings: Settings) -> bool:
     """Return whether a store was made for another margin, so that its distances are computed again."""
-    if not path.exists() or not path.stat().st_size:
-        return False
-    try:
-        kept = Store.existing(path).settings().get("spec")
-    except CtxvalError:  # the campaign says it
-        return False
-    known, wanted = kept.get("margin") if isinstance(kept, dict) else None, settings.spec and settings.spec.margin
-    if not isinstance(kept, dict) or known == wanted:
+    kept = None
+    with suppress(CtxvalError):  # the campaign says it
+        if path.exists() and path.stat().st_size:
+            kept = Store.existing(path).settings().get("spec")
+    if not isinstance(kept, dict) or kept.get("margin") == (settings.spec and settings.spec.margin):
         return False
     notes.say(f"{path} was made for another margin: the distances of its executions are computed again.")
     return True
 
 
 def _print_safety(report: SafetyReport, drawn: DrawnTasks | None) -> None:
-    units = report.units
-
-    def of(value: float | None, before: str = "") -> str:
-        return "unknown" if value is None else f"{before}{value:.4g} {units}".rstrip()
+    def of(value: float | None) -> str:
+        return "unknown" if value is None else f"{value:.4g} {report.units}".rstrip()
 
     if report.answer is not None and report.margin is not None:
-        colour = {"validated": "green", "falsified": "red", "undecided": "yellow"}[report.answer]
-        out.say((report.answer.upper(), f"bold {colour}"), f": margin {of(report.margin)}")
+        out.say((report.answer.upper(), f"bold {base.COLOURS[report.answer]}"), f": margin {of(report.margin)}")
     out.say(report.statement[0].upper() + report.statement[1:], wrap=True)
     executed, predicted = "largest executed", "predicted to be at most"
     certified = "not certified" if report.d_b_bound is None else f"certified at most {of(report.d_b_bound)}"
-    rows = {
-        "largest deviation": f"{executed} {of(report.d_a)}, {predicted} {of(report.d_a_bound)}",
-        "largest margin of an unsafe task": f"{executed} {of(report.d_b)}, {certified}",
-    }
+    rows = {"largest deviation": f"{executed} {of(report.d_a)}, {predicted} {of(report.d_a_bound)}"}
+    rows["largest margin of an unsafe task"] = f"{executed} {of(report.d_b)}, {certified}"
     if report.share_by_deviation is not None:
         rows["safe if no deviation is larger"] = f"{100 * report.share_by_deviation:.1f} %, which is not certified"
     if report.tightened is not None:
@@ -308,10 +277,9 @@ def _print_safety(report: SafetyReport, drawn: DrawnTasks | None) -> None:
     elif report.d_b_bound is not None and isinstance(report.spec, ReachAvoid):
         rows["sets on the model"] = "nothing is left of a set that grows or shrinks by the bound"
     if drawn is not None:
-        rows["independent draws"] = (
-            f"{drawn.unsafe} of {drawn.draws} tasks with a margin above {of(drawn.margin)} are unsafe: at most "
-            f"{100 * drawn.share:.3g} % of them, with {100 * drawn.confidence:g} % confidence"
-        )
+        counts = f"{drawn.unsafe} of {drawn.draws} tasks with a margin above {of(drawn.margin)} are unsafe"
+        most = f"at most {100 * drawn.share:.3g} % of them, with {100 * drawn.confidence:g} % confidence"
+        rows["independent draws"] = f"{counts}: {most}"
     rows["between recorded times"] = f"the system moves by up to {of(report.between)}, which is not seen"
     rows["executions"] = str(report.executions)
     print_table(rows)

@@ -9,7 +9,8 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
+from dataclasses import field as attribute
 from functools import partial
 from itertools import pairwise
 from typing import Any, TypeVar
@@ -107,44 +108,31 @@ class Log(ShortRepr, ABC):
         return values[:, [index]]
 
 
+@dataclass(eq=False)
 class Table(Log):
-    """A log whose fields share one column of times.
+    """A log whose fields share one column of times."""
 
-    Args:
-        source: the file, and the episode in it, for messages.
-        names: the names of the columns.
-        columns: a function that returns columns by name, each of shape ``(N,)``, or ``(N, k)`` for vectors.
-        word: what counts the rows in messages: ``line`` or ``row``.
-        first: the number of the first row in messages.
-        period: seconds between two rows, if the log states it.
-        marks: a function that returns a column whose values are only compared with each other; ``columns`` by default.
-    """
-
-    def __init__(
-        self,
-        source: str,
-        names: Sequence[str],
-        columns: Callable[[Sequence[str]], Mapping[str, Array]],
-        *,
-        word: str = "row",
-        first: int = 0,
-        period: float | None = None,
-        marks: Callable[[str], Array] | None = None,
-    ) -> None:
-        self.source, self.word, self.first, self.period = source, word, first, period
-        self._names, self._columns = tuple(names), columns
-        self._marks = marks or (lambda name: columns([name])[name])
+    source: str  #: the file, and the episode in it, for messages
+    names: Sequence[str] = attribute(repr=False)
+    #: a function that returns columns by name, each of shape ``(N,)``, or ``(N, k)`` for vectors
+    columns: Callable[[Sequence[str]], Mapping[str, Array]] = attribute(repr=False)
+    _: KW_ONLY
+    word: str = "row"  #: what counts the rows in messages: ``line`` or ``row``
+    first: int = 0  #: the number of the first row in messages
+    period: float | None = None  #: seconds between two rows, if the log states it
+    #: a function that returns a column whose values are only compared with each other; ``columns`` by default
+    marks: Callable[[str], Array] | None = attribute(default=None, repr=False)
 
     def fields(self) -> tuple[str, ...]:
-        return self._names
+        return tuple(self.names)
 
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
-        require_distinct(self.source, self._names)
-        find = partial(column_of, self.source, self._names)
+        require_distinct(self.source, self.names)
+        find = partial(column_of, self.source, self.names)
         located = {field: self._located(field, find) for field in fields}
         time, time_unit = self._time(clock)
         wanted = [*(name for (name, _), _ in located.values()), *filter(None, [time])]
-        arrays = self._columns(list(dict.fromkeys(wanted)))
+        arrays = self.columns(list(dict.fromkeys(wanted)))
         if time is None:
             times = np.asarray(np.arange(max(map(len, arrays.values()))) * float(clock.period or 0), dtype=np.float64)
         else:
@@ -161,8 +149,9 @@ class Table(Log):
 
     def episodes(self, used: Sequence[str]) -> list[Log]:
         """Return one table for each run of rows with one number in a column such as ``episode``."""
-        counters = [name for name in self._names if name.lower() in EPISODES and name not in used]
-        marks = [values for values in map(self._marks, counters) if values.ndim == 1 and len(values) > 1]
+        counters = [name for name in self.names if name.lower() in EPISODES and name not in used]
+        counts = [self.marks(name) if self.marks else self.columns([name])[name] for name in counters]
+        marks = [values for values in counts if values.ndim == 1 and len(values) > 1]
         if not marks or len({len(values) for values in marks}) > 1:
             return [self]
         changed = np.any([mark[1:] != mark[:-1] for mark in marks], axis=0)
@@ -170,35 +159,31 @@ class Table(Log):
 
         def rows(start: int, stop: int, names: Sequence[str]) -> dict[str, Array]:
             if missing := [name for name in names if name not in read]:  # each column is read once for all episodes
-                read.update(self._columns(missing))
+                read.update(self.columns(missing))
             for name in names:
                 if len(read[name]) not in (count, count - 1):
-                    raise InputError(
-                        f"{self.source}: {name} must have {count} rows, as the numbers of recordings have, got "
-                        f"{read[name].shape}."
-                    )
+                    wanted = f"{count} rows, as the numbers of recordings have"
+                    raise InputError(f"{self.source}: {name} must have {wanted}, got {read[name].shape}.")
             return {name: read[name][start:stop] for name in names}
 
         def episode(start: int, stop: int) -> Table:
             number = str(marks[0][start]).removesuffix(".0")
             source, columns = f"{self.source}, {counters[0].partition('_')[0]} {number}", partial(rows, start, stop)
-            return Table(source, self._names, columns, word=self.word, first=self.first + start, period=self.period)
+            return Table(source, self.names, columns, word=self.word, first=self.first + start, period=self.period)
 
         return [episode(*ends) for ends in pairwise([0, *(np.flatnonzero(changed) + 1).tolist(), count])]
 
     def _time(self, clock: Clock) -> tuple[str | None, str]:
         """Return the column of the times and its unit; None if rows have equal steps."""
         if clock.field is not None:
-            column = column_of(self.source, self._names, clock.field)
+            column = column_of(self.source, self.names, clock.field)
             if column is None:
                 raise self.missing(clock.field)
         elif clock.period is not None:
             return None, ""
-        elif (column := time_column(self.source, self._names)) is None:
-            raise InputError(
-                f"{self.source} has no column of times ({', '.join(TIMES)}): name it with time, or give the time "
-                "between two rows."
-            )
+        elif (column := time_column(self.source, self.names)) is None:
+            how = "name it with time, or give the time between two rows"
+            raise InputError(f"{self.source} has no column of times ({', '.join(TIMES)}): {how}.")
         name, unit = column
         if unit and clock.unit and unit != clock.unit:
             raise InputError(f"{self.source} has its times in {unit}, and time_unit states {clock.unit}.")
@@ -228,15 +213,12 @@ class MemoryTable(Table):
 
 @dataclass(frozen=True, eq=False)
 class Message(ShortRepr):
-    """One message of a topic, and when it was recorded and sent, in nanoseconds.
-
-    The content is a mapping, or an object with an attribute for each field.
-    """
+    """One message of a topic."""
 
     topic: str
-    logged: int
-    published: int
-    content: Any
+    logged: int  #: when it was recorded, nanoseconds
+    published: int  #: when it was sent, nanoseconds
+    content: Any  #: a mapping, or an object with an attribute for each field
 
 
 class TopicLog(Log):
@@ -265,11 +247,8 @@ class TopicLog(Log):
         size = 0
         for message in self.messages(records):
             of_topic = records[message.topic]
-            values = {
-                field: self._value(message, len(of_topic), path)
-                for field, (topic, path) in split.items()
-                if topic == message.topic
-            }
+            paths = {field: path for field, (topic, path) in split.items() if topic == message.topic}
+            values = {field: self._value(message, len(of_topic), path) for field, path in paths.items()}
             stamps = {"log": message.logged, "publish": message.published, "header": _header(message.content)}
             of_topic.append((stamps, values))
             size += sum(256 + value.nbytes for value in values.values())
@@ -282,21 +261,18 @@ class TopicLog(Log):
         times = {topic: [stamps[chosen] for stamps in of_topic] for topic, of_topic in all_stamps.items()}
         for topic, of in times.items():
             if None in of:
-                raise InputError(
-                    f"{self.source}, message {of.index(None)} of {topic}: it has no header.stamp or timestamp."
-                )
+                message_text = f"{self.source}, message {of.index(None)} of {topic}"
+                raise InputError(f"{message_text}: it has no header.stamp or timestamp.")
         origin = min((min(of) for of in times.values() if of), default=0)
         signals = {}
         for field, (topic, _) in split.items():
             if not times[topic]:
                 raise InputError(f"{self.source} has no message with the field {field!r}.")
             column = [values[field] for _, values in records[topic]]
-            row = next((row for row, value in enumerate(column) if len(value) != len(column[0])), None)
-            if row is not None:
-                raise InputError(
-                    f"{self.source}, message {row} of {field}: it must have {len(column[0])} numbers, got "
-                    f"{len(column[row])}."
-                )
+            for row, value in enumerate(column):
+                if len(value) != len(column[0]):
+                    must = f"it must have {len(column[0])} numbers, got {len(value)}"
+                    raise InputError(f"{self.source}, message {row} of {field}: {must}.")
             seconds = np.array([1e-9 * (time - origin) for time in times[topic]])
             _, unit, weak = named_unit(field)
             array = np.array(column).reshape(len(seconds), -1)
@@ -322,10 +298,8 @@ class TopicLog(Log):
         except (TypeError, ValueError):
             shown = "nothing" if value is None else repr(value)[:60]
             name = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path).removeprefix(".")
-            raise InputError(
-                f"{self.source}, message {number} of {message.topic}: {name} must be a number or a list of numbers, "
-                f"got {shown}."
-            ) from None
+            must = f"{name} must be a number or a list of numbers, got {shown}"
+            raise InputError(f"{self.source}, message {number} of {message.topic}: {must}.") from None
 
 
 def _header(content: Any) -> int | None:
@@ -336,11 +310,8 @@ def _header(content: Any) -> int | None:
 
 
 def _plausible(stamps: Mapping[str, Sequence[Mapping[str, Any]]]) -> bool:
-    """Return whether all messages have stamps that increase on each topic and agree with the log times up to 1 s.
-
-    The stamps may be those of another clock, such as that of a simulator, if it is the same one for all topics.
-    """
-    late = list[int]()
+    """Return whether all messages have stamps that increase on each topic and agree with the log times up to 1 s."""
+    late = list[int]()  # the clock may be another one, such as that of a simulator, if all topics have the same one
     for of_topic in stamps.values():
         headers = [stamp["header"] for stamp in of_topic]
         if None in headers or any(b <= a for a, b in pairwise(headers)):

@@ -135,12 +135,10 @@ class LogMapping(ShortRepr):
     @property
     def fields(self) -> dict[str, Field]:
         """All recorded fields by name, the states first; derivatives are none of them."""
-        recorded = {name: field for name, field in self.states.items() if not field.derivative_of}
-        return {**recorded, **self.inputs}
+        return {name: field for name, field in self.states.items() if not field.derivative_of} | dict(self.inputs)
 
     @property
     def clock(self) -> Clock:
-        """Where the times come from."""
         return Clock(self.time, self.time_unit, None, self.stamp)
 
     @property
@@ -177,9 +175,8 @@ class LogMapping(ShortRepr):
                 case str(path):
                     parts[kind] = {path: path}
                 case [*listed]:
-                    parts[kind] = {
-                        str(item.get("path") if isinstance(item, Mapping) else item): item for item in listed
-                    }
+                    paths = [item.get("path") if isinstance(item, Mapping) else item for item in listed]
+                    parts[kind] = dict(zip(map(str, paths), listed, strict=True))
                 case named:
                     raise InputError(f"{kind} must be a table of fields or a list of paths, got {named!r}.")
         if "states" not in table:
@@ -217,10 +214,9 @@ class LogMapping(ShortRepr):
         vectors = ("states", "x", "observation.state")
         usual = _usual(columns, vectors, "x"), _usual(columns, ("inputs", "u", "action"), "u")
         if not usual[0]:
-            raise InputError(
-                f"{log.source} has no states under a usual name ({', '.join(vectors)}, x0): name the states and inputs "
-                f"with --state and --input or in a mapping; the fields are {enumerated(columns, LISTED)}."
-            )
+            how = "name the states and inputs with --state and --input or in a mapping"
+            known = f"{', '.join(vectors)}, x0): {how}; the fields are {enumerated(columns, LISTED)}"
+            raise InputError(f"{log.source} has no states under a usual name ({known}.")
         return LogMapping(*usual, dt=log.period)
 
 

@@ -63,11 +63,9 @@ def read_mat(path: Path) -> list[Log]:
 
 
 def _version_7_3(path: Path) -> dict[str, Any]:
-    """Return the recordings of ControlDesk in an HDF5 file, or its numeric arrays, after everything in it is checked.
-
-    HDF5 lets a file name others: by links, as the storage of a data set, and as the source of a virtual one. A
-    stranger's file would name any file of the user. MATLAB writes none of these.
-    """
+    """Return the recordings of ControlDesk in an HDF5 file, or its numeric arrays, after all in it is checked."""
+    # HDF5 lets a file name others, such as any of the user: by links, as the storage of a data set, and as the source
+    # of a virtual one. MATLAB writes none of these.
     h5py = require_extra("h5py", "logs", "MATLAB files of version 7.3 need")
     checked, numeric, size = dict[str, Any](), list[str](), 0
     with h5py.File(path, "r") as file:
@@ -89,14 +87,12 @@ def _version_7_3(path: Path) -> dict[str, Any]:
 
 
 def _hdf5_elements(h5py: Any, file: Any, checked: Mapping[str, Any], path: str) -> list[dict[str, Any]]:
-    """Return the texts and numbers of a structure or an array of structures; empty if none has ``Data``.
-
-    The fields of an array of structures are arrays of references to objects in the group ``#refs#``.
-    """
+    """Return the texts and numbers of a structure or an array of structures; empty if none has ``Data``."""
     names = _FIELDS[path.rpartition(".")[2]]
     fields = {name: checked[f"{path}.{name}"] for name in names if f"{path}.{name}" in checked}
     if "Data" not in fields:
         return []
+    # The fields of an array of structures are arrays of references to objects in the group `#refs#`.
     references = {name: item for name, item in fields.items() if item.get_type().get_class() == h5py.h5t.REFERENCE}
     if not references:
         return [{name: _value(h5py, item) for name, item in fields.items()}]
@@ -106,11 +102,9 @@ def _hdf5_elements(h5py: Any, file: Any, checked: Mapping[str, Any], path: str) 
         if not item.get_type().equal(h5py.h5t.STD_REF_OBJ) or math.prod(item.shape) > _MOST:
             return []
         # What was not checked, such as a structure in the place of numbers, has no value.
-        opened = [
-            h5py.h5r.dereference(reference, file.id) if reference else None
-            for reference in h5py.Dataset(item)[()].ravel()
-        ]
-        targets = [place and by_address.get(h5py.h5o.get_info(place).addr) for place in opened]
+        read = h5py.Dataset(item)[()].ravel()
+        opened = [reference and h5py.h5r.dereference(reference, file.id) for reference in read]
+        targets = [by_address.get(h5py.h5o.get_info(place).addr) if place else None for place in opened]
         columns[name] = [np.zeros(0) if target is None else _value(h5py, target) for target in targets]
     if len({len(column) for column in columns.values()}) > 1:
         return []  # cells in one structure
@@ -209,10 +203,8 @@ class ControlDeskLog(Log):
 
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
         if clock.field is not None:
-            raise InputError(
-                f"{self.source} is a recording of ControlDesk, whose signals have times of their own: the mapping must "
-                f"not name {clock.field!r} as its time."
-            )
+            why = "whose signals have times of their own: the mapping must not name"
+            raise InputError(f"{self.source} is a recording of ControlDesk, {why} {clock.field!r} as its time.")
         located = {field: self._located(field, self._signal) for field in fields}
         times = {axis: self._times(axis) for (_, axis), _ in located.values()}
         signals = {}
@@ -221,10 +213,8 @@ class ControlDeskLog(Log):
             array = values[:, None] if values.ndim == 1 else values
             array = array if len(array) == rows else array.T
             if len(array) != rows:
-                raise InputError(
-                    f"{self.source}: {field} must have {rows} values, as its times X({axis + 1}) have, got "
-                    f"{values.shape}."
-                )
+                wanted = f"{rows} values, as its times X({axis + 1}) have"
+                raise InputError(f"{self.source}: {field} must have {wanted}, got {values.shape}.")
             unit = _text(element, "Unit")
             signals[field] = Signal(times[axis], self._component(field, array, index), 0, "sample", unit)
         return signals
@@ -244,14 +234,9 @@ class ControlDeskLog(Log):
 
 
 def is_control_desk(structure: Any) -> bool:
-    """Return whether a structure is a recording of ControlDesk: it has times, and signals with names and numbers.
-
-    X and Y are mappings, or lists of them, with arrays of numbers as ``Data`` and texts as ``Name``, ``Unit`` and
-    ``Raster``.
-    """
-    if not isinstance(structure, Mapping):
-        return False
-    return any(_numbers(x).size for x in _elements(structure, "X")) and bool(_named(structure))
+    """Return whether a structure is a recording of ControlDesk: it has times, and signals with names and numbers."""
+    is_mapping = isinstance(structure, Mapping)
+    return is_mapping and any(_numbers(x).size for x in _elements(structure, "X")) and bool(_named(structure))
 
 
 def _named(structure: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -259,6 +244,7 @@ def _named(structure: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def _elements(structure: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
+    """Return X or Y, a mapping or a list of them: numbers as ``Data``, texts as ``Name``, ``Unit`` and ``Raster``."""
     value = structure.get(name)
     given = [value] if isinstance(value, Mapping) else value
     return [part for part in given if isinstance(part, Mapping)] if isinstance(given, list | np.ndarray) else []
@@ -282,10 +268,8 @@ def _axis_of(source: str, element: Mapping[str, Any], rasters: Sequence[str]) ->
     if stated is not None and np.size(stated) == 1:
         number = float(np.asarray(stated, dtype=np.float64).item())
         if not number.is_integer() or not 1 <= number <= len(rasters):
-            raise InputError(
-                f"{source}: XIndex of {_text(element, 'Name')} must be a number from 1 to {len(rasters)}, got "
-                f"{number:g}."
-            )
+            wanted = f"a number from 1 to {len(rasters)}"
+            raise InputError(f"{source}: XIndex of {_text(element, 'Name')} must be {wanted}, got {number:g}.")
         return int(number) - 1
     raster = _text(element, "Raster")
     return rasters.index(raster) if raster in rasters else 0

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import bz2
 import io
-import itertools
 import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator
@@ -41,6 +40,8 @@ _library = partial(require_extra, extra="logs", needs="logs of messages need")
 class _FileOfMessages(TopicLog):
     """A log of messages in a file or a folder; each of its channels has a decoder."""
 
+    _kind = "an MCAP file"
+
     def __init__(self, path: Path) -> None:
         self.source, self._path = str(path), path
         self._topics: dict[str, Any] = {}
@@ -48,6 +49,14 @@ class _FileOfMessages(TopicLog):
 
     def topics(self) -> tuple[str, ...]:
         return tuple(self._topics)
+
+    def _read(self, records: Iterator[Any]) -> Iterator[Any]:
+        while True:
+            with reading(self._path, self._kind):
+                record = next(records, None)
+            if record is None:
+                return
+            yield record
 
     def _decoded(
         self, channel: Any, topic: str, data: bytes, message: str, definition: Callable[[], Definition]
@@ -59,8 +68,8 @@ class _FileOfMessages(TopicLog):
         try:
             return self._decoders[channel](data)
         except Exception as error:  # decoders raise many kinds
-            why = quoted(reason_of(error))
-            raise InputError(f"{self.source}, message {message}: it cannot be decoded ({why}).") from error
+            why = f"it cannot be decoded ({quoted(reason_of(error))})"
+            raise InputError(f"{self.source}, message {message}: {why}.") from error
 
 
 class McapLog(_FileOfMessages):
@@ -68,7 +77,7 @@ class McapLog(_FileOfMessages):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        with self._opened() as file, reading(path, "an MCAP file"):
+        with self._opened() as file, reading(path, self._kind):
             file.seek(-(8 + 29), io.SEEK_END)  # the footer and the magic bytes, https://mcap.dev/spec
             summary = next(self._records(file)).summary_start  # 0 if there is none
             file.seek(summary)
@@ -100,10 +109,7 @@ class McapLog(_FileOfMessages):
         wanted = set(topics)
         schemas, channels = dict[int, Any](), dict[int, Any]()
         with self._opened() as file:
-            records = self._records(file)
-            while True:
-                with reading(self._path, "an MCAP file"):
-                    record: Any = next(records, None)
+            for record in self._read(self._records(file)):
                 match type(record).__name__:
                     case "Schema":
                         schemas[record.id] = record
@@ -114,8 +120,6 @@ class McapLog(_FileOfMessages):
                         message = f"{record.sequence} of {channel.topic}"
                         content = self._decoded(channel.id, channel.topic, record.data, message, definition)
                         yield Message(channel.topic, record.log_time, record.publish_time, content)
-                    case "NoneType":
-                        return
 
     def _definition(self, schema: Any, channel: Any) -> Definition:
         encoding = getattr(schema, "encoding", None)
@@ -123,11 +127,9 @@ class McapLog(_FileOfMessages):
             return json_decoder, "", b""
         if (make := _DECODERS.get((channel.message_encoding, encoding))) is not None:
             return make, schema.name, schema.data
-        of = f" with a schema in {encoding}" if schema is not None else ""
-        raise InputError(
-            f"{self.source}: the messages of {channel.topic} are in {channel.message_encoding}{of}; messages in json, "
-            "in protobuf, in cdr with ros2msg and in ros1 with ros1msg can be read."
-        )
+        of = channel.message_encoding + ("" if schema is None else f" with a schema in {encoding}")
+        known = "messages in json, in protobuf, in cdr with ros2msg and in ros1 with ros1msg can be read"
+        raise InputError(f"{self.source}: the messages of {channel.topic} are in {of}; {known}.")
 
 
 class BagLog(_FileOfMessages):
@@ -157,12 +159,7 @@ class BagLog(_FileOfMessages):
         wanted = set(topics)
         with self._reader() as reader:
             records = reader.messages([connection for connection in reader.connections if connection.topic in wanted])
-            for number in itertools.count():
-                with reading(self._path, self._kind):
-                    record = next(records, None)
-                if record is None:
-                    return
-                connection, time, raw = record
+            for number, (connection, time, raw) in enumerate(self._read(records)):
                 topic, definition = connection.topic, partial(self._definition, connection)
                 content = self._decoded(topic, topic, raw, f"{number}, of {topic}", definition)
                 yield Message(topic, time, time, content)
@@ -181,10 +178,7 @@ class BagLog(_FileOfMessages):
 
 
 def _decompressed(kind: str, data: bytes) -> bytes:
-    """Return the content of a chunk, of which no more is decompressed than may be read.
-
-    The sizes that a file declares may be wrong, and libraries believe them or those in the compressed data.
-    """
+    """Return the content of a chunk, but no more than may be read: the sizes that a file declares may be wrong."""
     match kind:
         case "zstd":
             content = _library("zstandard").ZstdDecompressor().stream_reader(data).read(_MOST_CHUNK + 1)
@@ -299,8 +293,6 @@ def ros1_decoder(name: str, definition: bytes) -> Decoder:
     return decode
 
 
-_DECODERS: dict[tuple[str, str | None], Callable[[str, bytes], Decoder]] = {
-    ("cdr", "ros2msg"): ros2_decoder,
-    ("ros1", "ros1msg"): ros1_decoder,
-    ("protobuf", "protobuf"): protobuf_decoder,
-}
+_DECODERS: dict[tuple[str, str | None], Callable[[str, bytes], Decoder]]
+_DECODERS = {("cdr", "ros2msg"): ros2_decoder, ("ros1", "ros1msg"): ros1_decoder}
+_DECODERS["protobuf", "protobuf"] = protobuf_decoder

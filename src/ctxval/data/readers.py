@@ -10,6 +10,7 @@ import json
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,11 +34,7 @@ def read_csv(path: Path) -> list[Log]:
     if not names:
         raise InputError(f"{path} must be a table with one name for each column, and has no header.")
     first = next((line for line, _ in table.rows()), 2)
-
-    def columns(wanted: Sequence[str]) -> dict[str, Array]:
-        return table.columns(wanted, missing=wanted)
-
-    return [Table(str(path), names, columns, word="line", first=first, marks=table.texts)]
+    return [Table(str(path), names, partial(table.columns, missing=names), word="line", first=first, marks=table.texts)]
 
 
 def read_npz(path: Path) -> list[Log]:
@@ -54,14 +51,10 @@ def read_npz(path: Path) -> list[Log]:
         return [Table(str(path), archive.names, columns)]
     times, states, inputs = columns(["times", "states", "inputs"]).values()
     if inputs.ndim != 3 or len(inputs) != len(states):
-        raise InputError(
-            f"{path} cannot be read: states {states.shape} and inputs {inputs.shape} are not those of one batch of "
-            "trajectories, (batch, H + 1, n) and (batch, H, m)."
-        )
-    return [
-        MemoryTable(f"{path}, trajectory {k}", {"times": times, "states": x, "inputs": u})
-        for k, (x, u) in enumerate(zip(states, inputs, strict=True))
-    ]
+        given, wanted = f"states {states.shape} and inputs {inputs.shape}", "(batch, H + 1, n) and (batch, H, m)"
+        raise InputError(f"{path} cannot be read: {given} are not those of one batch of trajectories, {wanted}.")
+    runs = enumerate(zip(states, inputs, strict=True))
+    return [MemoryTable(f"{path}, trajectory {k}", {"times": times, "states": x, "inputs": u}) for k, (x, u) in runs]
 
 
 # Parquet
@@ -137,9 +130,8 @@ def component_names(paths: Sequence[str | Path]) -> Mapping[str, list[str]]:
 def read_json_records(path: Path) -> list[Log]:
     """Return the log in a JSON file: a list of records, or an object with one list of records.
 
-    A field of a record is a number, true or false, or a list of numbers; ``name.part`` is one of an object in it. What
-    is missing or null in a record is NaN. Numbers beside the list, such as a gain, hold for all records. Files that end
-    in ``.gz`` are decompressed.
+    A field is a number, true or false, or a list of numbers; ``name.part`` is one of an object in a record. What is
+    missing or null is NaN. Numbers beside the list, such as a gain, hold for all records.
     """
     packed = read_bytes(path)
     with reworded(f"{path} cannot be read as JSON", OSError, EOFError, zlib.error, ValueError, RecursionError):
@@ -152,9 +144,8 @@ def read_json_records(path: Path) -> list[Log]:
     around = content if isinstance(content, Mapping) else {"": content}
     tables = [each for each in around.values() if each and type(each) is list and {*map(type, each)} == {dict}]
     if len(tables) != 1:
-        raise InputError(
-            f'{path} must have one list of records, as [{{"t": 0.0, "x": 1.5}}, ...]; it has {len(tables)} such lists.'
-        )
+        example = '[{"t": 0.0, "x": 1.5}, ...]'
+        raise InputError(f"{path} must have one list of records, as {example}; it has {len(tables)} such lists.")
     numeric = (int, float, list, type(None))
     rows = [{path: value for path, value in leaves(row, depth=4) if isinstance(value, numeric)} for row in tables[0]]
     columns = dict[str, Array]()
@@ -186,10 +177,8 @@ READERS: dict[str, Callable[[Path], list[Log]]] = {
 }
 """The reader of each suffix."""
 
-_READABLE = (
-    f"files must end in {', '.join(READERS)}, and folders must be bags of ROS 2 or LeRobot data sets, or contain such "
-    "files"
-)
+_FOLDERS = "folders must be bags of ROS 2 or LeRobot data sets, or contain such files"
+_READABLE = f"files must end in {', '.join(READERS)}, and {_FOLDERS}"
 
 
 def read_logs(paths: Sequence[str | Path]) -> list[Log]:
@@ -208,7 +197,7 @@ def is_log(path: Path) -> bool:
     """Return whether a path can only be a log of a program: no CSV, NPZ or JSON file, and no plain folder."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file() or is_lerobot(path)
-    return path.suffix.lower() in READERS and path.suffix.lower() not in (".csv", ".npz", ".json")
+    return path.suffix.lower() in READERS.keys() - {".csv", ".npz", ".json"}
 
 
 def is_lerobot(path: Path) -> bool:
@@ -217,18 +206,17 @@ def is_lerobot(path: Path) -> bool:
 
 
 def _logs(path: Path) -> list[Log]:
+    if (path / "metadata.yaml").is_file():
+        return [BagLog(path)]
+    if is_lerobot(path):
+        return read_lerobot(path)
     if path.is_dir():
-        if (path / "metadata.yaml").is_file():
-            return [BagLog(path)]
-        if is_lerobot(path):
-            return read_lerobot(path)
         return [log for file in logs_in(path) for log in _logs(file)]
     if not path.exists():
         raise InputError(f"there is no file {path}.")
-    reader = READERS.get(path.suffix.lower())
-    if reader is None:
+    if (suffix := path.suffix.lower()) not in READERS:
         raise InputError(f"{path} is not a log that can be read: {_READABLE}.")
-    return reader(path)
+    return READERS[suffix](path)
 
 
 def logs_in(folder: Path) -> list[Path]:
@@ -237,8 +225,3 @@ def logs_in(folder: Path) -> list[Path]:
     if not files:
         raise InputError(f"the folder {folder} has no log: {_READABLE}.")
     return files
-
-
-def task_of(path: Path) -> str:
-    """Return the name of a log without its endings: the name of its task, if there is one file for each."""
-    return path.stem if path.suffix.lower() != ".gz" else Path(path.stem).stem

@@ -20,7 +20,7 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.log import Log, Signal, Table
 from ctxval.data.mapping import LogMapping, Observer
-from ctxval.data.readers import component_names, logs_in, read_logs, task_of
+from ctxval.data.readers import component_names, logs_in, read_logs
 from ctxval.data.sampling import Break, Channel, sampled
 from ctxval.errors import ExecutionError, InputError
 
@@ -85,10 +85,8 @@ def recordings_of(
 ) -> Recordings:
     """Return the recordings in logs; ``names`` are those of the components of vector fields, if they are known."""
     chosen = LogMapping.usual(logs[0]) if mapping is None else mapping
-    runs: list[Recording] = []
-    breaks: list[Break] = []
-    notes: list[str] = []
-    dt, first = chosen.dt, list[Channel]()
+    runs, breaks, notes, first = list[Recording](), list[Break](), list[str](), list[Channel]()
+    dt = chosen.dt
     used = [field.path for field in chosen.fields.values()]
     for log in (episode for whole in logs for episode in whole.episodes(used)):
         channels = _channels(log, chosen, names or {}, notes)
@@ -97,15 +95,13 @@ def recordings_of(
             raise InputError(f"{log.source} has other states or inputs than {logs[0].source}: read them separately.")
         first = first or channels
         channels = [_in_unit_of(log, *pair) for pair in zip(channels, first, strict=True)]
-        dt = _period(log, channels[0]) if dt is None else dt
+        dt = _mean_period(log, channels[0]) if dt is None else dt
         # States must not be recorded much less often than every step, or have times of another unit.
         period = min((channel.period for channel in channels if not channel.of_input and channel.period), default=dt)
         if chosen.longest_gap is None and (period > FAR * dt or unit_advice(period, dt)):
             usual = f"give dt = {period:g}, or longest_gap if states are to be interpolated over so many steps"
-            raise InputError(
-                f"{log.source} has a sample of {channels[0].name} every {period:g} s, and a step takes {dt:g} s: "
-                f"{unit_advice(period, dt) or usual}."
-            )
+            times = f"a sample of {channels[0].name} every {period:g} s, and a step takes {dt:g} s"
+            raise InputError(f"{log.source} has {times}: {unit_advice(period, dt) or usual}.")
         parts, gaps = sampled(log.source, channels, dt, chosen.delay, chosen.longest_gap)
         runs += [Recording(log.source, start, trajectory) for start, trajectory in parts]
         breaks += gaps
@@ -113,22 +109,16 @@ def recordings_of(
         why = "; ".join(map(str, breaks[:3]))
         raise InputError(f"no log has two samples of all states and inputs in a row: {why or 'they are empty'}.")
     how = [] if chosen.dt is not None else [f"the time step {dt:g} s is the mean period of {first[0].path}"]
-    how += [
-        f"{channel.name} is recorded every {channel.period:.3g} s, less often than every step of {dt:g} s: its values "
-        "between two samples are interpolated"
-        for channel in first
-        if not channel.of_input and channel.period > 1.2 * dt
-    ]
+    for channel in first:
+        if not channel.of_input and channel.period > 1.2 * dt:
+            seldom = f"every {channel.period:.3g} s, less often than every step of {dt:g} s"
+            how.append(f"{channel.name} is recorded {seldom}: its values between two samples are interpolated")
     if chosen.delay:
         how.append(f"inputs act {chosen.delay:g} s after they are logged")
-    states, inputs = (
-        {channel.name: channel.unit for channel in first if channel.of_input == of_input} for of_input in (False, True)
-    )
+    states = {channel.name: channel.unit for channel in first if not channel.of_input}
+    inputs = {channel.name: channel.unit for channel in first if channel.of_input}
     whole = Recordings(tuple(runs), tuple(breaks), dt, states, inputs, (*how, *dict.fromkeys(notes)))
-    whole = _with_derivatives(whole, chosen)
-    if isinstance(chosen.observer, Observer):
-        whole = _with_observer(whole, chosen.observer)
-    return _with_lags(whole, chosen.lags)
+    return _with_lags(_with_observer(_with_derivatives(whole, chosen), chosen), chosen.lags)
 
 
 def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], notes: list[str]) -> list[Channel]:
@@ -143,7 +133,7 @@ def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], not
         signal = signals[field.path]
         values = signal.values.copy()
         if condition is not None:
-            status, equal, number = signals[condition[0]], condition[1], condition[2]
+            status, equal, number = signals[condition[0]], *condition[1:]
             at = np.searchsorted(status.times, signal.times, side="right") - 1
             rows = slice(None) if status.times is signal.times else np.maximum(at, 0)
             values[(status.values[rows, 0] == number) != equal] = np.nan
@@ -155,19 +145,10 @@ def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], not
         for k, column in enumerate(values.T):
             label = components[k] if len(components) == width else (name if width == 1 else f"{name}{k}")
             _without_marks(f"{log.source}: {label}", column, scale, signal, notes)
-            channels.append(
-                Channel(
-                    label,
-                    field.unit or (signal.unit if field.factor is None else ""),
-                    name in mapping.inputs,
-                    signal.times,
-                    scale * column + field.offset,
-                    angle=field.angle,
-                    held=field.held,
-                    path=field.path,
-                    place=(signal.word, signal.first),
-                )
-            )
+            unit = field.unit or (signal.unit if field.factor is None else "")
+            converted = scale * column + field.offset
+            about = field.angle, field.held, field.path, (signal.word, signal.first)
+            channels.append(Channel(label, unit, name in mapping.inputs, signal.times, converted, *about))
     # In LeRobot data sets, states and actions have the same names.
     states = {channel.name for channel in channels if not channel.of_input}
     return [
@@ -179,10 +160,8 @@ def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], not
 def _without_marks(name: str, column: Array, scale: float, signal: Signal, notes: list[str]) -> None:
     for value in sentinels(column, scale):
         marked = column == value
-        notes.append(
-            f"{name} is {value:g} in {counted(int(marked.sum()), signal.word)}, far from all other values: it is taken "
-            "as missing"
-        )
+        places = counted(int(marked.sum()), signal.word)
+        notes.append(f"{name} is {value:g} in {places}, far from all other values: it is taken as missing")
         column[marked] = np.nan
     largest = float(np.abs(column[np.isfinite(column)]).max(initial=0.0))
     if largest > 1e100:  # squares of errors must be finite
@@ -193,16 +172,14 @@ def _in_unit_of(log: Log, channel: Channel, first: Channel) -> Channel:
     if channel.unit == first.unit:
         return channel
     if not channel.unit or not first.unit:
-        raise InputError(
-            f"{log.source} has {channel.name} in {channel.unit or 'an unknown unit'}, and other logs have it in "
-            f"{first.unit or 'an unknown unit'}: state its unit in all files, or in none."
-        )
-    factor = conversion(channel.unit, first.unit)
-    return replace(channel, unit=first.unit, values=factor * channel.values)
+        here, others = (each.unit or "an unknown unit" for each in (channel, first))
+        others = f"other logs have it in {others}: state its unit in all files, or in none"
+        raise InputError(f"{log.source} has {channel.name} in {here}, and {others}.")
+    return replace(channel, unit=first.unit, values=conversion(channel.unit, first.unit) * channel.values)
 
 
-def _period(log: Log, channel: Channel) -> float:
-    """Return the mean period of a channel, in which longer steps count as several ones."""
+def _mean_period(log: Log, channel: Channel) -> float:
+    """Return the mean period, in which longer steps count as several ones."""
     steps = np.diff(channel.times)
     steps = steps[np.isfinite(steps) & (steps > 0)]
     if not len(steps):
@@ -226,10 +203,8 @@ def _with_derivatives(recordings: Recordings, mapping: LogMapping) -> Recordings
     known, dt = list(recordings.states), recordings.dt
     for name, field in derived.items():
         if field.derivative_of not in known:
-            raise InputError(
-                f"{name} is the derivative of {field.derivative_of!r}, which must be a recorded state with one "
-                f"component; these are {', '.join(known)}."
-            )
+            wanted = f"which must be a recorded state with one component; these are {', '.join(known)}"
+            raise InputError(f"{name} is the derivative of {field.derivative_of!r}, {wanted}.")
     # Components of vectors have names of their own, and stay where their field is.
     order = []
     for name in mapping.states:
@@ -247,22 +222,22 @@ def _with_derivatives(recordings: Recordings, mapping: LogMapping) -> Recordings
     for name, field in derived.items():
         base_unit = recordings.states[field.derivative_of]
         units[name] = field.unit or (f"{base_unit}/s" if base_unit else "")
-        notes.append(
-            f"{name} is the derivative of {field.derivative_of}, that of a parabola through {field.window} records "
-            f"around each: it looks {field.window // 2 * dt:.3g} s ahead, so a controller would have it that much later"
-        )
+        fitted = f"that of a parabola through {field.window} records around each"
+        later = f"{field.window // 2 * dt:.3g} s ahead, so a controller would have it that much later"
+        notes.append(f"{name} is the derivative of {field.derivative_of}, {fitted}: it looks {later}")
     named = {label: units[label] for label in order}
     return replace(recordings, runs=tuple(runs), breaks=breaks, states=named, notes=tuple(notes))
 
 
-def _with_observer(recordings: Recordings, observer: Observer) -> Recordings:
+def _with_observer(recordings: Recordings, mapping: LogMapping) -> Recordings:
+    observer = mapping.observer
+    if not isinstance(observer, Observer):
+        return recordings
     name = observer.reference or getattr(observer.function, "__name__", "")
     if observer.function is None:
-        raise InputError(
-            f"the observer {name} is not loaded: replay, fit and start do it; in Python, give the mapping the function."
-        )
-    runs: list[Recording] = []
-    breaks, widths = list(recordings.breaks), set[int]()
+        how = "replay, fit and start do it; in Python, give the mapping the function"
+        raise InputError(f"the observer {name} is not loaded: {how}.")
+    runs, breaks, widths = list[Recording](), list(recordings.breaks), set[int]()
     for run in recordings.runs:
         y, u = run.trajectory.states, run.trajectory.inputs
         with reworded(f"the observer {name} failed on {run.source}"):  # the user's function
@@ -287,11 +262,9 @@ def _with_observer(recordings: Recordings, observer: Observer) -> Recordings:
     if not states:
         states = recordings.states if n == len(recordings.states) else {f"x{k}": "" for k in range(n)}
     if widths != {len(states)}:
-        raise InputError(
-            f"the observer {name} must return {len(states)} states ({enumerated(states, 6)}), got {max(widths)}."
-        )
-    note = f"the states are estimated by {name} from {enumerated(recordings.states, 6)}"
-    notes = (*recordings.notes, note)
+        wanted = f"{len(states)} states ({enumerated(states, 6)})"
+        raise InputError(f"the observer {name} must return {wanted}, got {max(widths)}.")
+    notes = (*recordings.notes, f"the states are estimated by {name} from {enumerated(recordings.states, 6)}")
     return replace(recordings, runs=tuple(runs), breaks=tuple(breaks), states=states, notes=notes)
 
 
@@ -361,7 +334,8 @@ class Recorded:
                 whole = read_recordings([path], chosen).runs
                 if len(whole) != 1:
                     raise InputError(f"{path} must have one recording without gaps, and has {len(whole)}.")
-                self.runs[task_of(path)] = whole[0].trajectory
+                name = path.stem if path.suffix.lower() != ".gz" else Path(path.stem).stem
+                self.runs[name] = whole[0].trajectory
         if not self.runs:
             raise InputError("there is no recording.")
 

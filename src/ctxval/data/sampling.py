@@ -58,20 +58,19 @@ def sampled(
     source: str, channels: Sequence[Channel], dt: float, delay: float, longest_gap: float | None
 ) -> tuple[list[tuple[float, Trajectory]], list[Break]]:
     """Return the parts of a log in which all channels have values, at equal steps, and where it was split."""
-    parts: list[tuple[float, Trajectory]] = []
-    breaks: list[Break] = []
+    parts, breaks = list[tuple[float, Trajectory]](), list[Break]()
     for pieces in _forward_pieces(source, channels, breaks):
         moved = [replace(channel, times=channel.times + delay) if channel.of_input else channel for channel in pieces]
         common: list[Interval] = [(-np.inf, np.inf)]
         for channel in moved:
             common = _intersection(common, _intervals(source, channel, longest_gap, breaks))
-        for interval in common:
-            part = _part(source, moved, interval, dt)
+        for start, end in common:
+            part = _part(source, moved, start, end, dt)
             if part is not None:
                 parts.append(part)
-            elif np.isfinite(interval).all():
-                length = interval[1] - interval[0]
-                breaks.append(Break(source, interval[0], length, "a part", f"of {length:.3g} s is shorter than a step"))
+            elif np.isfinite([start, end]).all():
+                reason = f"of {end - start:.3g} s is shorter than a step"
+                breaks.append(Break(source, start, end - start, "a part", reason))
     return parts, breaks
 
 
@@ -85,17 +84,15 @@ def _forward_pieces(source: str, channels: Sequence[Channel], breaks: list[Break
             back = np.flatnonzero(np.diff(channel.times) <= 0)
             if len(back):
                 k, (word, line) = int(back[0]), channel.place
-                raise InputError(
-                    f"{source}, {word} {line + k + 1} of {channel.path}: its time must be after that of the one "
-                    f"before, {channel.times[k]:.9g} s, got {channel.times[k + 1]:.9g} s."
-                )
+                must = f"its time must be after that of the one before, {channel.times[k]:.9g} s"
+                where = f"{source}, {word} {line + k + 1} of {channel.path}"
+                raise InputError(f"{where}: {must}, got {channel.times[k + 1]:.9g} s.")
         return [list(channels)]
     still = np.flatnonzero(steps == 0)
     if len(still) > 1 + 0.1 * len(first.times):  # single rows may be written twice
-        raise InputError(
-            f"{source}: {len(still)} of {len(first.times)} {word}s have the time of the {word} before, the first "
-            f"{word} {line + int(still[0]) + 1}, {first.times[still[0]]:.9g} s: give times with more digits."
-        )
+        what = f"{len(still)} of {len(first.times)} {word}s have the time of the {word} before"
+        where = f"the first {word} {line + int(still[0]) + 1}, {first.times[still[0]]:.9g} s"
+        raise InputError(f"{source}: {what}, {where}: give times with more digits.")
     ends = np.flatnonzero(steps <= 0).tolist()
     for end in ends:
         before, after = f"{first.times[end]:g} s", f"{first.times[end + 1]:g} s"
@@ -154,8 +151,9 @@ def _intersection(first: list[Interval], second: list[Interval]) -> list[Interva
     return both
 
 
-def _part(source: str, channels: Sequence[Channel], interval: Interval, dt: float) -> tuple[float, Trajectory] | None:
-    start, end = interval
+def _part(
+    source: str, channels: Sequence[Channel], start: float, end: float, dt: float
+) -> tuple[float, Trajectory] | None:
     samples = channels[0].times  # steps begin at samples of the first state, if its input is delayed by a part of one
     later = samples[np.searchsorted(samples, start - _SLACK * dt) :][:1]
     if len(later) and 0 < later[0] - start < channels[0].period:
@@ -170,8 +168,8 @@ def _part(source: str, channels: Sequence[Channel], interval: Interval, dt: floa
     for channel in channels:
         if channel.of_input:  # it holds until the next sample, which may come within a step
             good = np.isfinite(channel.values)
-            means = held_means(channel.times[good], channel.values[good, None], start + times, _SLACK * dt)
-            inputs.append(means[:, 0])
+            held = channel.times[good], channel.values[good, None]
+            inputs.append(held_means(*held, start + times, _SLACK * dt)[:, 0])
         else:
             states.append(_interpolated(channel, start + times))
     columns = np.stack(inputs, axis=-1) if inputs else np.empty((int(steps), 0))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
+from ctxval import Task, TaskSuite, Trajectory, Validation
 from ctxval._util.progress import stage
 from ctxval._util.representation import task_text
 from ctxval._util.texts import reason_of
@@ -19,10 +20,6 @@ from ctxval.core.experiment import Experiment, mixed_units_sentence
 from ctxval.core.labels import labels_of, names_of
 from ctxval.core.plan import Plan, require_repeatable
 from ctxval.core.soundness import MISSED, SATURATED, goal_misses
-from ctxval.core.task import Task
-from ctxval.core.task_suite import TaskSuite
-from ctxval.core.trajectory import Trajectory
-from ctxval.core.validation import Validation
 from ctxval.errors import ConformanceError, CtxvalError
 from ctxval.learning.extended import with_states_of_model
 from ctxval.specs import Specification
@@ -48,33 +45,26 @@ def check_experiment(
     """Check that the parts of an experiment fit together, and what the model says of its specification."""
     validation = experiment.validation
     plans: list[Plan] = []
-    findings = _checked({"space": lambda: _space(validation), "tasks": lambda: _tasks(validation, seed, plans)})
+    findings = _checked({"space": _space(validation), "tasks": _tasks(validation, seed, plans)})
     if not plans:
         return findings
     run = plans[0].model_trajectory
     counts = {"states": run.states.shape[-1], "inputs": run.inputs.shape[-1]}
     of_model = {**counts, "states": plans[0].task.initial_state.shape[-1]}  # others if outputs are recorded
-    return findings + _checked(
-        {
-            "controller on the model": lambda: _goals(validation, plans),
-            "convergence of the designs": lambda: _convergence_of(validation, plans),
-            "names": lambda: _names(experiment, counts),
-            "system": lambda: _system(validation, plans[0], counts),
-            "model": lambda: _model(validation, of_model),
-            "batches": lambda: _batches(validation, plans),
-            "distance": lambda: _distance(experiment, plans),
-            "specification": lambda: _specification(spec, plans),
-            "execution": lambda: _executions(validation, plans[1], execute),
-            "cost": lambda: _cost(validation, plans),
-        }
-    )
+    checks = {"controller on the model": _goals(validation, plans)}
+    checks |= {"convergence of the designs": _convergence_of(validation, plans), "names": _names(experiment, counts)}
+    checks |= {"system": _system(validation, plans[0], counts), "model": _model(validation, of_model)}
+    checks |= {"batches": _batches(validation, plans), "distance": _distance(experiment, plans)}
+    checks |= {"specification": _specification(spec, plans), "execution": _executions(validation, plans, execute)}
+    return findings + _checked(checks | {"cost": _cost(validation, plans)})
 
 
-def _checked(checks: Mapping[str, Callable[[], Findings]]) -> list[Checked]:
+def _checked(checks: Mapping[str, Findings]) -> list[Checked]:
+    """Return the findings of generators, each of which begins to check when it is asked for its first one."""
     findings = list[Checked]()
-    for name, check in checks.items():
+    for name, found in checks.items():
         try:
-            findings += [Checked(name, state, text) for state, text in check()]
+            findings += [Checked(name, state, text) for state, text in found]
         except Exception as error:  # a user's own part may raise anything
             reason = str(error) if isinstance(error, CtxvalError) else reason_of(error)
             findings.append(Checked(name, "failed", reason))
@@ -228,7 +218,8 @@ def _specification(spec: Specification | None, plans: Sequence[Plan]) -> Finding
     yield "ok" if satisfied else "failed", text
 
 
-def _executions(validation: Validation, plan: Plan, execute: bool) -> Findings:
+def _executions(validation: Validation, plans: Sequence[Plan], execute: bool) -> Findings:
+    plan = plans[1]
     if getattr(validation.system, "manual", False):
         yield "skipped", "people execute this system: see `ctxval ask`"
         return
@@ -267,14 +258,9 @@ def _cost(validation: Validation, plans: Sequence[Plan]) -> Findings:
 
 def aspect1_findings(report: Aspect1Report) -> list[Checked]:
     """Return what simulations of M show of its tasks and controllers, as sentences."""
-    return _checked(
-        {
-            "tasks on the model": lambda: _completion(report),
-            "neighbouring tasks": lambda: _flips(report),
-            "limits of the inputs": lambda: _saturated(report),
-            "convergence of the designs": lambda: _convergence(report.not_converged, report.designs),
-        }
-    )
+    checks = {"tasks on the model": _completion(report), "neighbouring tasks": _flips(report)}
+    checks |= {"limits of the inputs": _saturated(report)}
+    return _checked(checks | {"convergence of the designs": _convergence(report.not_converged, report.designs)})
 
 
 def _completion(report: Aspect1Report) -> Findings:
@@ -310,10 +296,9 @@ def _flips(report: Aspect1Report) -> Findings:
     if not flips.flipped:
         yield "ok", f"the inputs on M of {flips.pairs} pairs of neighbouring tasks differ by at most {largest}"
         return
-    text = (
-        f"{flips.flipped} of {flips.pairs} pairs of neighbouring tasks have controllers that differ abruptly, such as "
-    )
-    yield "noted", f"{text}{' and '.join(map(task_text, report.flipped))}, whose inputs on M differ by {largest}"
+    text = f"{flips.flipped} of {flips.pairs} pairs of neighbouring tasks have controllers that differ abruptly"
+    pair = " and ".join(map(task_text, report.flipped))
+    yield "noted", f"{text}, such as {pair}, whose inputs on M differ by {largest}"
 
 
 def _saturated(report: Aspect1Report) -> Findings:

@@ -1,7 +1,4 @@
-"""The parts of an experiment, made from the tables of an experiment file.
-
-A table names a part of a registry, or ``module:attr``. Only the latter, and parts of installed packages, are code.
-"""
+"""The parts of an experiment, made from tables that name a part of a registry, or code of users as ``module:attr``."""
 
 from __future__ import annotations
 
@@ -12,28 +9,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from ctxval import controllers, distances, models, systems
+from ctxval import Experiment, Parameters, TaskSpace, Transitions, cases, controllers, distances, models, systems
 from ctxval._util.checked import require, require_known
 from ctxval._util.files import Archive, read_bytes
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import Declaration, Registry, construct, declaration_of
 from ctxval.cli.config.references import accepts, is_function, reference, require_function, require_part
-from ctxval.core.experiment import Experiment
 from ctxval.core.model import Model
-from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.task import Task
 from ctxval.core.task_distribution import Normal
-from ctxval.core.trajectory import Transitions
 from ctxval.core.validation import Validation
 from ctxval.data import LogMapping, read_recordings
 from ctxval.errors import InputError
 from ctxval.models.saved import stored_transitions
-from ctxval.paper import cases
 
-REGISTRIES: dict[str, Registry[Any]] = {
-    registry.kind: registry
-    for registry in (systems.REGISTRY, models.REGISTRY, controllers.REGISTRY, distances.REGISTRY)
-}
+_REGISTRIES = (systems.REGISTRY, models.REGISTRY, controllers.REGISTRY, distances.REGISTRY)
+REGISTRIES: dict[str, Registry[Any]] = {registry.kind: registry for registry in _REGISTRIES}
 """Where the parts that an experiment file describes are found, by the name of their table."""
 
 
@@ -174,7 +165,7 @@ def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any,
 def require_types(what: str, function: Any, options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options, with lists converted to tuples."""
     target = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
-    hints = dict[str, Any]()
+    hints: dict[str, Any] = {}
     with suppress(NameError, TypeError):
         hints = get_type_hints(target, include_extras=True)
     given = {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}
@@ -185,12 +176,9 @@ def require_types(what: str, function: Any, options: Mapping[str, Any]) -> dict[
 def with_distribution(
     space: TaskSpace, tables: Mapping[str, Mapping[str, Any]], folder: Path | None = None
 ) -> TaskSpace:
-    """Return a task space with the distribution of tasks of an experiment file.
-
-    The tables are, for each parameter, ``{type = "normal", mean = ..., deviation = ...}``, ``{type = "uniform"}`` or
-    ``{ref = "module:attr"}`` of a frozen distribution of scipy.stats; or only ``sampler``, the reference of a function
-    ``(rng, n) -> tasks (n, d)``.
-    """
+    """Return a task space with a distribution of tasks: ``sampler`` alone, or one of each parameter."""
+    # The former is the reference of a function (rng, n) -> tasks (n, d), and the latter normal, uniform, or one of a
+    # frozen distribution of scipy.stats.
     if set(tables) == {"sampler"} and set(tables["sampler"]) == {"ref"} and "sampler" not in space.names:
         return space.sampled(argument(tables["sampler"], folder))
     for name in tables:
@@ -220,9 +208,8 @@ def named_experiment(text: str, seed: int, options: dict[str, Any], folder: Path
     experiment = reference(text, folder)
     if is_function(experiment) and not isinstance(experiment, Validation | Experiment):
         if not accepts(experiment, 1, **options):
-            given = f" {', '.join(options)}" if options else ""
-            takes = f"it takes {inspect.signature(experiment)}"
-            raise InputError(f"{text} must be callable with a seed and its options{given}; {takes}.")
+            given = f"{' ' if options else ''}{', '.join(options)}; it takes {inspect.signature(experiment)}"
+            raise InputError(f"{text} must be callable with a seed and its options{given}.")
         experiment = construct(text, experiment, options, seed)
     if isinstance(experiment, Validation):
         return Experiment(text.partition(":")[2], experiment)
@@ -233,10 +220,7 @@ def named_experiment(text: str, seed: int, options: dict[str, Any], folder: Path
 
 
 def plain_options(case: str) -> dict[str, Any]:
-    """Return the options of a case that a file or a command line can set, with their defaults.
-
-    The default of an option that must be given is None.
-    """
+    """Return the options of a case that a file can set, with their defaults; None for one that must be given."""
     hints, made = dict[str, Any](), cases.REGISTRY.find(case)
     with suppress(Exception):  # annotations that are texts are evaluated, and anything may stand in them
         hints = get_type_hints(made)

@@ -36,10 +36,8 @@ def reference(text: str, folder: Path | None = None) -> Any:
 
 @contextmanager
 def _searched_first(home: str) -> Iterator[str]:
-    """Put a folder first on ``sys.path``. It stays there, because a module may import others when it is called.
-
-    Meanwhile neither the current folder, which ``python -m`` adds, nor the folder of another experiment is searched.
-    """
+    """Put a folder first on ``sys.path``. It stays there, because a module may import others when it is called."""
+    # Meanwhile neither the current folder, which `python -m` adds, nor that of another experiment is searched.
     before = list(sys.path)
     if home not in before:
         _added.add(home)
@@ -70,10 +68,9 @@ def _require_place(text: str, module: str, home: str) -> None:
         raise InputError(f"{text} is in Python's standard library, which contains no part of an experiment.")
     loaded = sys.modules.get(module)
     if loaded is None and place is None:
-        raise InputError(
-            f"{text} cannot be loaded: no module named {module!r} is in {home} or installed. The modules of an "
-            "experiment file must be in the folder of the file, and those of the command line in the current one."
-        )
+        where = "in the folder of the file, and those of the command line in the current one"
+        why = f"no module named {module!r} is in {home} or installed"
+        raise InputError(f"{text} cannot be loaded: {why}. The modules of an experiment file must be {where}.")
     clash = (
         "{} cannot be loaded: a module named {!r} is already in use, {}, and {}. Rename one, or use another process."
     )
@@ -100,10 +97,7 @@ def _place(file: str | None, folders: Any) -> str | None:
 
 
 def require_part(registry: Registry[Any], what: str, value: Any) -> Any:
-    """Return an object or a class if it can be a part of the kind.
-
-    It must have the method of the kind; a model or a distance may also be a function.
-    """
+    """Return an object or a class if it has the method of the kind; a model or a distance may also be a function."""
     kind, method = registry.kind, str(registry.method)
     if isinstance(value, type):
         has = has_method(value, method)
@@ -111,10 +105,10 @@ def require_part(registry: Registry[Any], what: str, value: Any) -> Any:
         has = is_function(value) and accepts(value, 3)
     else:
         has = callable(getattr(value, method, None)) or (kind == "model" and is_function(value) and accepts(value, 2))
+    if not has and kind == "distance":
+        wanted = "a function (model_trajectory, system_trajectory, task) -> d written in Python"
+        raise InputError(f"{what} must be {wanted}, got {_named(value)}.")
     if not has:
-        if kind == "distance":
-            wanted = "a function (model_trajectory, system_trajectory, task) -> d written in Python"
-            raise InputError(f"{what} must be {wanted}, got {_named(value)}.")
         raise InputError(f"{what} must be a {kind}, got {_named(value)}, which has no {method}.")
     return value
 
@@ -130,10 +124,7 @@ def require_function(what: str, value: Any, form: str) -> Any:
 
 
 def is_function(value: Any) -> bool:
-    """Return whether an object is a function written in Python, or has a ``__call__`` that is one.
-
-    Builtin functions and methods of other libraries' objects do not count: no user wrote them for an experiment.
-    """
+    """Return whether an object is a function written in Python, or has a ``__call__`` that is one."""
     if isinstance(value, functools.partial):
         return is_function(value.func)
     if inspect.isfunction(_unwrapped(value)):
@@ -153,11 +144,10 @@ def _unwrapped(value: Any) -> Any:
 def accepts(function: Any, count: int, /, **named: Any) -> bool:
     """Return whether a function can be called with this number of positional arguments and these named ones."""
     try:
-        inspect.signature(function).bind(*range(count), **named)
+        with suppress(ValueError):  # the function has no signature
+            inspect.signature(function).bind(*range(count), **named)
     except TypeError:
         return False
-    except ValueError:  # the function has no signature
-        pass
     return True
 
 

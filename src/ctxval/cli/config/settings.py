@@ -13,11 +13,10 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
+from ctxval import Campaign, Experiment, Store, TaskSpace, TaskSuite, Validation, searches
 from ctxval._util.checked import require_known
 from ctxval._util.files import read_toml
-from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.interval_search import is_decisive
-from ctxval.campaign.storage.store import Store
 from ctxval.certificates import KINDS, RESOLUTION, CertificateOptions, require_use
 from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE, MOST_VOLUME, WITHIN
 from ctxval.certificates.prediction_tests import TESTS
@@ -25,19 +24,12 @@ from ctxval.cli.config import parts
 from ctxval.cli.config.parts import argument, part, require_types
 from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.signatures import code_named, signed
-from ctxval.core.experiment import Experiment
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.quantiles import QUANTILE
-from ctxval.core.space import TaskSpace
-from ctxval.core.task_suite import TaskSuite
-from ctxval.core.validation import Validation
 from ctxval.data import LogMapping
 from ctxval.distances import UnsafeMargin
 from ctxval.errors import CertificateError, InputError, UnknownNameError
 from ctxval.models import Refined, read_refined
-from ctxval.searches import DEFAULT as DEFAULT_SEARCH
-from ctxval.searches import REGISTRY as SEARCHES
-from ctxval.searches import Search, by_name
 from ctxval.studies.aspect1 import TASKS
 from ctxval.studies.safety import judged_by
 
@@ -45,22 +37,16 @@ Part = str | dict[str, Any]  #: ``module:attr``, or a table with a type and its 
 
 
 class CertificateTable(BaseModel, extra="allow"):
-    """The table ``[certificate]``: the certificate for the verdict, chosen before the campaign is run.
-
-    A kind of certificate from another package has its own options in the table.
-    """
+    """The table ``[certificate]``, chosen before a campaign; a kind from another package has its own options in it."""
 
     kind: str = "auto"
-    #: the share of the task space that may exceed the threshold
-    volume: float = Field(default=0.0, ge=0, le=MOST_VOLUME, strict=True)
-    #: the number of executions that must have been predicted beforehand at tasks drawn over the task space
-    tests: int = Field(default=TESTS, ge=0, strict=True)
+    volume: float = Field(default=0.0, ge=0, le=MOST_VOLUME, strict=True)  #: of the tasks above the threshold
+    tests: int = Field(default=TESTS, ge=0, strict=True)  #: executions at drawn tasks, predicted beforehand
     #: the share of the executions of each task that the verdict is about, if they differ by noise
     quantile: float = Field(default=QUANTILE, ge=0.5, lt=1, strict=True)
     #: the largest distance between a task and its nearest trial, in diagonals of the task space
     resolution: float = Field(default=RESOLUTION, gt=0, allow_inf_nan=False, strict=True)
-    #: the number of largest distances to discard, for ``sampling-discarding``
-    discard: int | None = Field(default=None, ge=0)
+    discard: int | None = Field(default=None, ge=0)  #: the largest distances, for ``sampling-discarding``
 
     @model_validator(mode="after")
     def _used(self) -> CertificateTable:
@@ -92,35 +78,28 @@ class CertificateTable(BaseModel, extra="allow"):
 class SearchTable(BaseModel, extra="allow"):
     """The table ``[search]``: the name of a search, and its options."""
 
-    name: str = DEFAULT_SEARCH
+    name: str = searches.DEFAULT
     repeats: int = Field(default=1, ge=1)
 
-    def build(self, folder: Path | None = None) -> Search:
+    def build(self, folder: Path | None = None) -> searches.Search:
         options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
-        options = require_types(f"search {self.name!r}", SEARCHES.find(self.name), options)
-        return by_name(self.name, repeats=self.repeats, **options)
+        options = require_types(f"search {self.name!r}", searches.REGISTRY.find(self.name), options)
+        return searches.by_name(self.name, repeats=self.repeats, **options)
 
 
 class Aspect1Table(BaseModel, extra="forbid"):
-    """The table ``[aspect1]``, which ``ctxval check --aspect1`` reads; a campaign does not use it.
+    """The table ``[aspect1]``, which ``ctxval check --aspect1`` reads; a campaign does not use it."""
 
-    The distance tells how far a trajectory is from completing its task; by default it is derived from that of the
-    experiment. The threshold is in the units of the goal.
-    """
-
-    distance: Part | None = None
-    threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
+    distance: Part | None = None  #: how far a trajectory is from completing its task; None to derive it
+    threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)  #: in the goal's units
     tasks: int = Field(default=TASKS, ge=2)
 
 
 class SpecTable(BaseModel, extra="allow"):
-    """The table ``[spec]``: what a closed loop shall do, which ``ctxval safe`` judges.
-
-    Its other entries are the arguments of the specification. The margin is the robustness of M that shall suffice for a
-    task to be safe; None to find it.
-    """
+    """The table ``[spec]``: what a closed loop shall do, with the arguments of the specification as other entries."""
 
     type: str = "ReachAvoid"
+    #: the robustness of M that shall suffice for a task to be safe; None to find it
     margin: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
 
     def on(self, experiment: Experiment) -> Experiment:
@@ -132,17 +111,13 @@ _WHOLE = ("space", "task", "system", "model", "synthesizer")
 
 
 class Settings(BaseModel, extra="forbid"):
-    """The content of an experiment file, overridden by the options of the command line.
+    """The content of an experiment file, overridden by the options of the command line."""
 
-    Either ``experiment`` names the experiment, or ``name`` to ``units`` describe it completely.
-    """
-
-    experiment: str | None = None
+    experiment: str | None = None  #: names the experiment; otherwise ``name`` to ``units`` describe it completely
     options: dict[str, Any] = Field(default_factory=dict)
     name: str | None = None
     space: dict[str, list[Any]] | None = None
-    #: the parameters of each task by its name, in the place of the space, if tasks are a list
-    suite: dict[str, dict[str, float | str]] | None = None
+    suite: dict[str, dict[str, float | str]] | None = None  #: tasks by name, in the place of the space
     #: see :func:`~ctxval.cli.config.parts.with_distribution`; a named experiment may have one too
     distribution: dict[str, dict[str, Any]] | None = None
     task: Part | None = None
@@ -156,10 +131,8 @@ class Settings(BaseModel, extra="forbid"):
     budget: int | None = Field(default=None, ge=1)
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
     longest: int | None = Field(default=None, ge=1, strict=True)
-    #: the task parameters that change the dynamics of the system; a named experiment may have some too
-    physical: list[str] | None = None
-    #: the indices of M's states that are recorded, or the function ``module:attr`` of them
-    outputs: str | list[int] | None = None
+    physical: list[str] | None = None  #: the task parameters that change the dynamics, also of a named experiment
+    outputs: str | list[int] | None = None  #: the indices of M's states that are recorded, or a function of them
     explore: bool | None = None  #: as the options of ``ctxval run``, so that a store knows the command that made it
     within: float = Field(default=WITHIN, gt=0, allow_inf_nan=False, strict=True)
     confidence: float = Field(default=CONFIDENCE, ge=LEAST_CONFIDENCE, lt=1, strict=True)
@@ -169,13 +142,10 @@ class Settings(BaseModel, extra="forbid"):
     search: SearchTable = Field(default_factory=SearchTable)
     aspect1: Aspect1Table = Field(default_factory=Aspect1Table)
     spec: SpecTable | None = None
-    #: whether the distance is judged or, as by ``ctxval safe``, the specification
-    judge: Literal["distance", "spec"] = "distance"
-    #: the file of a model that `ctxval refine` has learned from executions; it replaces the given model
-    refined: Path | None = None
+    judge: Literal["distance", "spec"] = "distance"  #: ``ctxval safe`` judges the specification
+    refined: Path | None = None  #: the file of a model by `ctxval refine`, which replaces the given model
     recordings: dict[str, Any] | None = None
-    #: the folder of modules and files, which is that of the experiment file; None for the current folder
-    folder: Path | None = None
+    folder: Path | None = None  #: that of modules and files, as of the experiment file; None for the current one
     file: str | None = None  #: the name of the experiment file, for the commands that reports state
 
     def load(self) -> Experiment:
@@ -220,9 +190,8 @@ class Settings(BaseModel, extra="forbid"):
             how = "name an experiment, as in experiment = 'pendulum', or describe one"
             raise InputError(f"the file must {how}: it has no {missing}.")
         if self.options:
-            raise InputError(
-                "[options] is only for a named experiment (experiment = ...); this file describes its own."
-            )
+            named = "a named experiment (experiment = ...)"
+            raise InputError(f"[options] is only for {named}; this file describes its own.")
         box = {name: tuple(bounds) for name, bounds in (self.space or {}).items()}
         space = TaskSpace(**box) if self.suite is None else TaskSuite(self.suite)
         system = part("system", self.system or {}, self.folder)
@@ -233,16 +202,10 @@ class Settings(BaseModel, extra="forbid"):
         if self.spec is not None:  # d_a, of the states that the specification looks at
             default = {"type": "MaximumDeviation", "components": (self.spec.model_extra or {}).get("components")}
         task = parts.task_function(self.task or {}, space, system, self.folder)
-        validation = Validation(
-            space=space,
-            task=task,
-            system=system,
-            model=part("model", self.model or {}, self.folder),
-            synthesizer=part("synthesizer", self.synthesizer or {}, self.folder),
-            distance=part("distance", self.distance or default, self.folder),
-            labels=Labels(labels_of(self.states), labels_of(self.inputs), self.units or ""),
-            outputs=outputs,
-        )
+        tables = {"model": self.model, "synthesizer": self.synthesizer, "distance": self.distance or default}
+        made = {kind: part(kind, table or {}, self.folder) for kind, table in tables.items()}
+        labels = Labels(labels_of(self.states), labels_of(self.inputs), self.units or "")
+        validation = Validation(space=space, task=task, system=system, labels=labels, outputs=outputs, **made)
         if isinstance(task, parts.TaskTable):
             validation.require_goal(task(space.parameters(space.low)))
         return Experiment(self.name or "experiment", validation)
@@ -251,15 +214,9 @@ class Settings(BaseModel, extra="forbid"):
         self, experiment: Experiment, store: Store | Path, *, accept_change: str | None = None, remeasure: bool = False
     ) -> Campaign:
         """Return a campaign, and sign these settings in its store: later commands may run the code that they name."""
-        campaign = Campaign(
-            experiment.validation,
-            search=self.search.build(self.folder),
-            store=store,
-            seed=self.seed,
-            name=experiment.name,
-            accept_change=accept_change,
-            remeasure=remeasure,
-        )
+        how: dict[str, Any] = {"accept_change": accept_change, "remeasure": remeasure, "name": experiment.name}
+        search = self.search.build(self.folder)
+        campaign = Campaign(experiment.validation, search=search, store=store, seed=self.seed, **how)
         plain = self.model_dump(mode="json", exclude={"store", "aspect1"})
         if self.folder is None and code_named(plain):
             plain["folder"] = str(Path().resolve())  # the folder in which its code was found now
@@ -281,13 +238,11 @@ class Settings(BaseModel, extra="forbid"):
 
     @property
     def explores(self) -> bool:
-        """Whether the search alone chooses the tasks, and spends the budget.
-
-        Unless that is stated, it does if a search other than ``auto`` or a certificate that ends no campaign is named.
-        """
+        """Whether the search alone chooses the tasks, and spends the budget."""
         if self.explore is not None:
             return self.explore
-        return self.search.name != DEFAULT_SEARCH or not is_decisive(self.certificate_options)
+        # By default if a search other than `auto` or a certificate that ends no campaign is named.
+        return self.search.name != searches.DEFAULT or not is_decisive(self.certificate_options)
 
     @property
     def log_mapping(self) -> LogMapping | None:
@@ -308,30 +263,27 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
     is_file = target.endswith(".toml")
     if not is_file and ":" not in target and Path(target).suffix:
         raise InputError(not_an_experiment(target))
-    content: dict[str, Any] = {"experiment": target}
-    if is_file:
-        if not os.path.lexists(target):
-            example = f"`ctxval init {shlex.quote(target)}` writes an example"
-            raise InputError(f"there is no experiment file {target}; {example}.")
-        content = read_toml(target)
+    if is_file and not os.path.lexists(target):
+        example = f"`ctxval init {shlex.quote(target)}` writes an example"
+        raise InputError(f"there is no experiment file {target}; {example}.")
+    content: dict[str, Any] = read_toml(target) if is_file else {"experiment": target}
     for key in sorted({"folder", "file"} & content.keys()):
         where = "modules and files are read from the folder of this file"
         raise InputError(f"{target}: no setting is called {key!r}; {where}.")
     given = {key: value for key, value in overrides.items() if value is not None}
-    options: Any = content.get("options", {})
-    search: Any = content.get("search", {})
+    options, search = content.get("options", {}), content.get("search", {})
     for key, table in (("options", options), ("search", search)):
         if not isinstance(table, dict):
             raise InputError(f"[{key}] must be a table, got {table!r}.")
     options = {**options, **given.pop("options", {})}
     named = given.pop("search", None)
-    if named is not None and named != search.get("name", DEFAULT_SEARCH):
+    if named is not None and named != search.get("name", searches.DEFAULT):
         search = {"name": named}  # the options in the file were those of another search
     whole = {**content, **given, "options": options, "search": search}
-    if is_file or ":" in target:
-        whole["folder"] = (Path(target).parent if is_file else Path()).resolve()
     if is_file:
-        whole["file"] = Path(target).name
+        whole |= {"folder": Path(target).parent.resolve(), "file": Path(target).name}
+    elif ":" in target:
+        whole["folder"] = Path().resolve()
     try:
         return Settings.model_validate(whole)
     except ValidationError as error:

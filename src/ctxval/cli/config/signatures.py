@@ -1,8 +1,4 @@
-"""Signatures of the settings in a store, and the settings that would run code.
-
-A command that writes settings signs them with a secret key of its user. Settings that were edited, or that come from
-somebody else, do not verify. A store keeps the signatures of several users.
-"""
+"""Signatures of the settings in a store by secret keys of its users, and the settings that would run code."""
 
 from __future__ import annotations
 
@@ -18,12 +14,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ctxval import searches
+from ctxval import cases, searches
 from ctxval._util.registry import declaration_of
 from ctxval.certificates import KINDS
 from ctxval.cli.config.parts import REGISTRIES
 from ctxval.errors import InputError
-from ctxval.paper import cases
 
 SIGNATURES = "signatures"  #: the key of the signatures in the settings of a store
 
@@ -132,17 +127,13 @@ def _read_key(path: Path) -> bytes:
 def code_named(settings: Mapping[str, Any]) -> list[str]:
     """Return the settings whose code would run if the experiment were built, each as a text to show.
 
-    Everything that is not known to be data counts as code: every reference, a task by name, a part of this package that
-    runs programs or other libraries, and every case, part, search and certificate that this package does not have. An
-    installed package may have it, and its code would be imported. This function does not search the packages.
+    Everything that is not known to be data counts as code: every reference, a task by name, a part that runs programs
+    or other libraries, and every name that this package does not have, since an installed one may have it.
     """
     # The key of a setting that names a part, the key of the name if it is a table, and the parts that are known.
-    named: list[tuple[str, str, Any]] = [
-        ("experiment", "", cases.REGISTRY),
-        *((kind, "type", registry) for kind, registry in REGISTRIES.items()),
-        ("search", "name", searches.REGISTRY),
-        ("certificate", "kind", KINDS),
-    ]
+    named: list[tuple[str, str, Any]] = [("experiment", "", cases.REGISTRY)]
+    named += ((kind, "type", registry) for kind, registry in REGISTRIES.items())
+    named += (("search", "name", searches.REGISTRY), ("certificate", "kind", KINDS))
     try:
         code = [_shown(key, settings[key]) for key in ("task", "outputs") if isinstance(settings.get(key), str)]
         match settings:

@@ -1,7 +1,4 @@
-"""The settings in a store, which of them may be used, and the campaign that they open.
-
-Settings that name code must be signed by this user.
-"""
+"""The settings in a store, those that may be used, since this user has signed what names code, and the campaign."""
 
 from __future__ import annotations
 
@@ -14,44 +11,36 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from ctxval import Campaign, Experiment, Store
 from ctxval._util.checked import PositiveFloat, PositiveInt, require
 from ctxval._util.registry import declaration_of
-from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
-from ctxval.campaign.storage.store import Store
 from ctxval.certificates import KINDS
 from ctxval.cli.base import Allowed, err
 from ctxval.cli.config.parts import REGISTRIES
 from ctxval.cli.config.settings import Settings, not_an_experiment, read_settings, sentence_of
 from ctxval.cli.config.signatures import code_named, unsigned, verifies, why_no_key
-from ctxval.core.experiment import Experiment
 from ctxval.errors import InputError
 
 
 def planned_settings(store: Store, kind: str | None = None) -> Settings:
-    """Return the settings in a store, whoever wrote them; the defaults if no command made the store.
-
-    Do not build anything from them: :func:`trusted_settings` returns those that may be used.
-    """
+    """Return the settings in a store, whoever wrote them, from which nothing may be built; the defaults if none."""
     kept = store.settings()
     if not kept:
         return Settings()
     settings = _of_store(kept)
     planned = settings.certificate.kind
     if kind is None and not KINDS.is_data(planned) and not verifies(kept):
-        raise InputError(
-            f"{store.name} names the certificate {planned!r}, which is code of another package, and you did not make "
-            f"the store. Give --kind {planned} if you trust that package, or give another kind."
-        )
+        why = f"{store.name} names the certificate {planned!r}, which is code of another package"
+        how = f"Give --kind {planned} if you trust that package, or give another kind."
+        raise InputError(f"{why}, and you did not make the store. {how}")
     return settings
 
 
 def _of_store(kept: dict[str, Any]) -> Settings:
     if not kept:
-        raise InputError(
-            "the store does not name its experiment, because it was not made by a command: name the experiment with "
-            "--experiment FILE.toml."
-        )
+        why = "the store does not name its experiment, because it was not made by a command"
+        raise InputError(f"{why}: name the experiment with --experiment FILE.toml.")
     try:
         return Settings.model_validate(unsigned(kept))
     except ValidationError as error:
@@ -82,26 +71,18 @@ def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool
     unknown = "You did not make the store on this computer, or it was changed since"
     known = "If you know its experiment, name it with --experiment FILE.toml (or module:attr). If you trust the"
     if not code:
-        files = "; ".join(outside[:8])
-        raise InputError(
-            f"{store.path} names files outside its folder: {files}. {unknown}. {known} store, give --trust."
-        )
+        files = f"files outside its folder: {'; '.join(outside[:8])}"
+        raise InputError(f"{store.path} names {files}. {unknown}. {known} store, give --trust.")
     more = f" and {len(code) - 8} more" if len(code) > 8 else ""
-    raise InputError(
-        f"{store.path} would import or run code: {'; '.join(code[:8])}{more}, from the folder "
-        f"{ascii(str(folder))[:200]}. {unknown}, or an older version made it. {known} code that the store names, give "
-        "--trust. The store then carries your signature, and the question will not be asked again."
-    )
+    what = f"{'; '.join(code[:8])}{more}, from the folder {ascii(str(folder))[:200]}"
+    then = "The store then carries your signature, and the question will not be asked again."
+    known = f"{unknown}, or an older version made it. {known} code that the store names, give --trust"
+    raise InputError(f"{store.path} would import or run code: {what}. {known}. {then}")
 
 
-_FILE_KEYS = {"refined", "data", "logs"}.union(
-    *(
-        declared.files
-        for registry in REGISTRIES.values()
-        for name in registry.built_in
-        if (declared := declaration_of(registry.find(name)))
-    )
-)
+_PARTS = (declaration_of(registry.find(name)) for registry in REGISTRIES.values() for name in registry.built_in)
+
+_FILE_KEYS = {"refined", "data", "logs"}.union(*(declared.files for declared in _PARTS if declared))
 """The keys of settings whose texts are paths."""
 
 
@@ -160,15 +141,13 @@ def open_store(path: Path, allowed: Allowed, *, remeasure: bool = False) -> Open
     except InputError as error:
         if settings.folder is None or settings.folder.is_dir():
             raise
-        raise InputError(
-            f"{error} The store names the folder {str(settings.folder)!a}, which does not exist any more: name the "
-            "experiment at its present place with --experiment FILE.toml or module:attr."
-        ) from error
+        gone = f"The store names the folder {str(settings.folder)!a}, which does not exist any more"
+        how = "name the experiment at its present place with --experiment FILE.toml or module:attr"
+        raise InputError(f"{error} {gone}: {how}.") from error
     campaign = settings.campaign(experiment, store, accept_change=allowed.accept_change, remeasure=remeasure)
     if asked and code_named(store.settings()):
-        reason = why_no_key()
         does = "now carries your signature, and the question will not be asked again"
-        if reason is not None:
+        if (reason := why_no_key()) is not None:
             does = f"cannot carry your signature, and the question will be asked again: {reason}"
         err.say(f"{path} {does}.")
     return Opened(settings, experiment, campaign, path)

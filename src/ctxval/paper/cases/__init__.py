@@ -39,13 +39,10 @@ def by_name(name: str, /, seed: int = 0, **options: Any) -> Experiment:
 
 
 def options_of(name: str) -> dict[str, Any]:
-    """Return the options of a case with their defaults, ``inspect.Parameter.empty`` if there is none.
-
-    The first parameter of a case is its seed, which is not an option.
-    """
+    """Return the options of a case with their defaults, ``inspect.Parameter.empty`` if there is none."""
     case = REGISTRY.find(name)
     try:
-        parameters = list(inspect.signature(case).parameters.values())[1:]
+        parameters = list(inspect.signature(case).parameters.values())[1:]  # the first one is the seed
     except (TypeError, ValueError) as error:
         raise InputError(f"the case {name!r} must be a function of a seed and its options: {error}.") from error
     variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)

@@ -16,16 +16,8 @@ from ctxval.paper.reproduce.systems import ArmModels, ArmSamples, DubinsMedians,
 
 __all__ = ["FULL", "QUICK", "STUDIES", "Scale", "Study", "reproduce", "studies_named"]
 
-STUDIES: tuple[Study, ...] = (
-    FourFrameworks(),
-    Trajectories(),
-    Techniques(),
-    ConvergedGP(),
-    DubinsMedians(),
-    ArmSamples(),
-    ArmModels(),
-    LinearComplexity(),
-)
+_OF_PENDULUM: tuple[Study, ...] = (FourFrameworks(), Trajectories(), Techniques(), ConvergedGP())
+STUDIES = (*_OF_PENDULUM, DubinsMedians(), ArmSamples(), ArmModels(), LinearComplexity())
 """The studies behind the paper's figures, in the order of the paper."""
 
 
@@ -33,10 +25,9 @@ def studies_named(name: str) -> list[Study]:
     """Return the study with this name, or all studies for ``all``."""
     if name == "all":
         return list(STUDIES)
-    studies = [study for study in STUDIES if study.name == name]
-    if not studies:
-        raise UnknownNameError.among("study", name, ["all", *(study.name for study in STUDIES)])
-    return studies
+    if studies := [study for study in STUDIES if study.name == name]:
+        return studies
+    raise UnknownNameError.among("study", name, ["all", *(study.name for study in STUDIES)])
 
 
 def reproduce(

@@ -12,17 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from ctxval import Validation, distances, systems
+from ctxval import Task, Trajectory, Validation, rollout, systems
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval.core.model import Model, linearize
-from ctxval.core.rollout import rollout
-from ctxval.core.task import Task
-from ctxval.core.trajectory import Trajectory
 from ctxval.distances import FinalState, WholeTrajectory
 from ctxval.errors import ModelError
 from ctxval.paper.cases import pendulum
 
-WHOLE, FINAL = distances.WholeTrajectory(norm=np.inf), distances.FinalState(norm=1)
+WHOLE, FINAL = WholeTrajectory(norm=np.inf), FinalState(norm=1)
 """The distance of OLDT and CCDT, and that of OLCD and CuSTOM."""
 
 PAPERS_GOAL = 0.04  #: the goal angle of the paper's Fig. 2, rad, where CCDT is largest in the paper.
@@ -38,8 +35,8 @@ if it exceeds the closed-loop distance here, it also does so with the far larger
 def frameworks(seed: int = 0, *, per_axis: int = 2001, restarts: int = 64) -> dict[str, Any]:
     """Return the goal angles, and the distance between M and S in each framework, as a stored result has them.
 
-    Those of CCDT and CuSTOM are for each goal; those of OLDT and OLCD, which are the same for every goal, are for each
-    restart of the search, largest first.
+    Those of CCDT and CuSTOM are for each goal; those of OLDT and OLCD, the same for every goal, are for each restart of
+    the search, largest first.
     """
     validation = pendulum.experiment(seed).validation
     goals = validation.space.grid(per_axis)
@@ -48,19 +45,12 @@ def frameworks(seed: int = 0, *, per_axis: int = 2001, restarts: int = 64) -> di
     hanging = validation.task(validation.space.parameters([0.0]))
     assert isinstance(validation.system, systems.Simulated)  # as in the running example
     steps = validation.system.model, validation.model
-    open_loops = [
-        worst_open_loop(*steps, hanging, BOUND, distance, restarts=restarts, seed=seed)[1].tolist()
-        for distance in (WHOLE, FINAL)
-    ]
-    return {
-        "goals": goals[:, 0].tolist(),
-        "ccdt": WHOLE(on_model, on_system, task).tolist(),
-        "custom": FINAL(on_model, on_system, task).tolist(),
-        "oldt": open_loops[0],
-        "olcd": open_loops[1],
-        "bound": BOUND,
-        "closed_loop_torque": max(float(np.abs(loop.inputs).max()) for loop in (on_model, on_system)),
-    }
+    result: dict[str, Any] = {"goals": goals[:, 0].tolist()}
+    result |= {"ccdt": WHOLE(on_model, on_system, task).tolist(), "custom": FINAL(on_model, on_system, task).tolist()}
+    for name, distance in (("oldt", WHOLE), ("olcd", FINAL)):
+        result[name] = worst_open_loop(*steps, hanging, BOUND, distance, restarts=restarts, seed=seed)[1].tolist()
+    largest = max(float(np.abs(loop.inputs).max()) for loop in (on_model, on_system))
+    return {**result, "bound": BOUND, "closed_loop_torque": largest}
 
 
 def closed_loops(validation: Validation, task: Task) -> tuple[Trajectory, Trajectory]:
@@ -78,10 +68,7 @@ def closed_loops(validation: Validation, task: Task) -> tuple[Trajectory, Trajec
 # every single switch guard against poor local maxima. The result is a lower bound of the true maximum.
 
 Slope = Callable[[Array, Rows], Array]
-"""A convex function of the gaps ``(..., N, H + 1, n)`` of some restarts, by its subgradient W; it is ``sum(W * gap)``.
-
-It is a linear function of the gap, or a norm: then W has unit dual norm.
-"""
+"""The subgradient W of a function of the gaps ``(..., N, H + 1, n)``, linear or a norm, which is ``sum(W * gap)``."""
 
 
 def worst_open_loop(
@@ -94,18 +81,12 @@ def worst_open_loop(
     restarts: int = 64,
     seed: int = 0,
 ) -> tuple[Array, Array]:
-    """Maximise the distance between M and S over the inputs ``|u| <= bound``, from the task's initial state.
+    """Return the inputs ``(H, 1)`` within the bound under which M and S differ most, and the distances ``(R,)``.
 
-    With ``WholeTrajectory(norm=inf)`` it is the paper's OLDT, with ``FinalState(norm=1)`` its OLCD. A restart depends
-    only on the seed and on its own number, so that more restarts never find less, except for rounding.
-
-    Args:
-        system: the step of a simulated S, which is the ``model`` of ``systems.Simulated``; it has one input.
-        distance: one of the two distances, with norm 1 or infinity.
-        restarts: number R of sequences that are improved.
-
-    Returns:
-        The best inputs ``(H, 1)``, and the final distance of each restart, largest first, shape ``(R,)``.
+    The distance, with norm 1 or infinity, is ``WholeTrajectory(norm=inf)`` for OLDT and ``FinalState(norm=1)`` for OLCD
+    in the paper. The system is the step of a simulated S with one input. The distances are those of R improved
+    sequences, largest first. Each depends only on the seed and its number, so more restarts never find less, except for
+    rounding.
     """
     pair = _Pair(system, model, task, bound)
     counts = np.ones((task.horizon + 1, task.initial_state.size))
@@ -164,10 +145,7 @@ class _Pair:
         return np.asarray((slope(gap, rows) * gap).sum(axis=(-1, -2)))
 
     def gradient(self, U: Array, weights: Array) -> Array:
-        """Gradient of ``sum(weights * gap)`` with respect to the inputs, shape ``(..., H, 1)``.
-
-        The weights of the states are propagated back to the inputs by the adjoint ``l_t = w_t + A_t' l_(t+1)``.
-        """
+        """Gradient of ``sum(weights * gap)`` in the inputs, by the adjoint ``l_t = w_t + A_t' l_(t+1)``."""
         of_system, of_model = np.empty_like(U), np.empty_like(U)
         for model, gradient in ((self.system, of_system), (self.model, of_model)):
             A, B = linearize(model, self.run(model, U).states[..., :-1, :], U)

@@ -20,13 +20,10 @@ import numpy as np
 import scipy
 from threadpoolctl import threadpool_info
 
-from ctxval import cases, searches
+from ctxval import Campaign, Experiment, Validation, cases, searches
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.code_digest import module_digest
 from ctxval._util.json_lines import JsonLines
-from ctxval.campaign.campaign import Campaign
-from ctxval.core.experiment import Experiment
-from ctxval.core.validation import Validation
 from ctxval.distances import TrackingError
 from ctxval.gp.kernels import Matern
 from ctxval.gp.surrogate import fit_surrogate
@@ -68,11 +65,8 @@ def measured_with(results: Iterable[Mapping[str, Any]], folders: tuple[str, ...]
     names = ", ".join(f"`{folder}`" for folder in folders)
     without = sum("sources" not in result for result in known)
     before = sum(result.get("sources", present) != present for result in known)
-    counts = {
-        f"with the present sources of {names}": len(known) - before - without,
-        "before their last change": before,
-        "before results named their sources and libraries": without,
-    }
+    counts = {f"with the present sources of {names}": len(known) - before - without}
+    counts |= {"before their last change": before, "before results named their sources and libraries": without}
     measured = "; ".join(f"{when}: {count:,}" for when, count in counts.items() if count)
     used = sorted({result["libraries"] for result in known if "libraries" in result})
     return f"Results measured {measured}." + (f" Libraries: {'; '.join(used)}." if used else "")
@@ -124,12 +118,8 @@ def _informed(job: Job) -> searches.Search:
 
 
 def records(distances: Array) -> list[list[float]]:
-    """Return ``[index, distance]`` of each distance that is among the six largest up to its index.
-
-    The estimates of SC and of SD with k = 5 depend on no other distances.
-    """
-    largest: list[float] = []
-    pairs = []
+    """Return ``[index, distance]`` of the distances among the six largest so far: all that SC and SD depend on."""
+    largest, pairs = list[float](), []
     for index, distance in enumerate(distances.tolist()):
         if distance > (largest[-1] if len(largest) > DISCARDED else -np.inf):
             largest = sorted([*largest, distance], reverse=True)[: DISCARDED + 1]
@@ -159,12 +149,12 @@ def run_job(job: Job) -> Result:
             search = _informed(job) if job.search in INFORMED else searches.by_name(job.search)
             if searches.BaseSearch.of(search).iid:
                 # The points do not depend on the distances, so all of them are executed in one batch.
-                search.reset(experiment.validation.space.dimension, job.seed)
-                points = experiment.validation.space.from_unit(search.ask(job.budget))
-                return {"executions": job.budget, "records": records(experiment.validation.distances(points))}
-            campaign = Campaign(experiment.validation, search=search, seed=job.seed, name=experiment.name)
+                search.reset(validation.space.dimension, job.seed)
+                points = validation.space.from_unit(search.ask(job.budget))
+                return {"executions": job.budget, "records": records(validation.distances(points))}
+            campaign = Campaign(validation, search=search, seed=job.seed, name=experiment.name)
             campaign.run(job.budget, explore=True)
-            points = experiment.validation.space.from_unit(np.array([trial.unit_point for trial in campaign.trials]))
+            points = validation.space.from_unit(np.array([trial.unit_point for trial in campaign.trials]))
             distances = [np.nan if trial.distance is None else trial.distance for trial in campaign.trials]
             return {"points": points.tolist(), "distances": distances}
         if job.kind == "truth":
@@ -178,32 +168,24 @@ def run_job(job: Job) -> Result:
             return _aspects(job, validation)
         # How far the closed loops on M and on S go below the paper's goal, and how far they are apart.
         model, system = closed_loops(validation, validation.task(validation.space.parameters([PAPERS_GOAL])))
+        loops = {"model": model, "system": system}
         gap = np.abs(system.states - model.states)
-        return {
-            "model_undershoot": PAPERS_GOAL - float(model.states[:, 0].min()),
-            "system_undershoot": PAPERS_GOAL - float(system.states[:, 0].min()),
-            "apart": float(gap.max()),
-            "end": float(gap[-1].sum()),
-        }
+        below = {f"{name}_undershoot": PAPERS_GOAL - float(loop.states[:, 0].min()) for name, loop in loops.items()}
+        return {**below, "apart": float(gap.max()), "end": float(gap[-1].sum())}
 
 
 def _aspects(job: Job, validation: Validation) -> Result:
-    """Return how far model and system are from completing their tasks (Remark 1).
-
-    For the arm, it is the final distance from a grid of targets. For other cases, it is the mean distance of the
-    position from the reference of random tasks, beside that of a car that goes straight ahead.
-    """
-    if job.case == "arm":
+    """Return how far model and system are from completing their tasks (Remark 1)."""
+    if job.case == "arm":  # the final distance from a grid of targets
         errors = arm.aspects(job.seed, **dict(job.options), per_axis=job.budget)
         return {"model_error": errors.model_error.tolist(), "system_error": errors.system_error.tolist()}
+    # The mean distance of the position from the reference of random tasks, beside that of a car straight ahead.
     points = validation.space.iid(job.budget, np.random.default_rng(job.seed))
     missed = TrackingError(components=(0, 1), over="mean")
     references = validation.task(validation.space.parameters(points)).reference
-    return {
-        "model_error": validation.on_model(missed).distances(points).tolist(),
-        "system_error": validation.with_parts(distance=missed).distances(points).tolist(),
-        "size": np.abs(references[..., 1:, 1]).mean(axis=-1).tolist(),
-    }
+    sides = {"model_error": validation.on_model(missed), "system_error": validation.with_parts(distance=missed)}
+    errors_of = {name: side.distances(points).tolist() for name, side in sides.items()}
+    return {**errors_of, "size": np.abs(references[..., 1:, 1]).mean(axis=-1).tolist()}
 
 
 class Results:
@@ -213,8 +195,7 @@ class Results:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._files: dict[str, JsonLines] = {}
+        self.folder, self._files = folder, dict[str, JsonLines]()
 
     def __contains__(self, job: Job) -> bool:
         result = self._of_kind(job.kind).get((job.key,))

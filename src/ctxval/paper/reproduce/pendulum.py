@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ctxval import cases, plot
+from ctxval import Trajectory, cases, plot
 from ctxval._util.arrays import Array
-from ctxval.core.trajectory import Trajectory
 from ctxval.gp.surrogate import fit_surrogate
 from ctxval.paper.reproduce import study
 from ctxval.paper.reproduce.frameworks import PAPERS_GOAL, closed_loops
@@ -54,7 +54,7 @@ class FourFrameworks(Study):
         open_loops = {name: [profile[name][0]] * len(profile["goals"]) for name in ("oldt", "olcd")}
         return {"goal_rad": profile["goals"], **open_loops, "ccdt": profile["ccdt"], "custom": profile["custom"]}
 
-    def claims(self, results: Results, scale: Scale) -> list[Claim]:
+    def claims(self, results: Results, scale: Scale) -> Iterator[Claim]:
         stored = [results[job] for job in self.jobs(scale)]
         trials, biased = stored[: scale.trials], stored[scale.trials :]
         profiles = [(np.array(trial["goals"]), np.array(trial["custom"])) for trial in trials]
@@ -64,24 +64,22 @@ class FourFrameworks(Study):
         oldt, olcd = ([trial[name][0] for trial in trials] for name in ("oldt", "olcd"))
         over = np.min([np.divide(oldt, ccdt), np.divide(olcd, custom)])
         gaps = [100 * (1 - np.median(trial[name]) / trial[name][0]) for trial in trials for name in ("oldt", "olcd")]
-        return [
-            _worst_goal("worst distance 0.3 rad near a goal of 2 rad", profiles),
-            _worst_goal("... with a bias in the training data, here only of angles from -pi to 0", of_half),
-            _two_regions("the profile is asymmetric, and poor around pi/2 and -pi/2", profiles),
-            _two_regions("... with this bias in the training data", of_half),
-            Claim(
-                f"CCDT is largest near a goal of {PAPERS_GOAL} rad",
-                f"largest at {ranged(farthest, 2)} rad, where it is {ranged(ccdt, 2)}",
-                agreement(max(abs(goal - PAPERS_GOAL) for goal in farthest) < 0.1),
-            ),
-            Claim(
-                "OLDT and OLCD are flat, and much higher than CCDT and CuSTOM",
-                f"OLDT {spread(oldt)[0]:.1f}, OLCD {spread(olcd)[0]:.1f} with |u| <= {trials[0]['bound']:g} N m, a "
-                f"bound of ours, without which there is no maximum: at least {over:.0f} times the closed-loop "
-                f"maximum; median restart within {max(gaps):.1f} % of the best",
-                agreement(bool(over > 2)),
-            ),
-        ]
+        yield _worst_goal("worst distance 0.3 rad near a goal of 2 rad", profiles)
+        yield _worst_goal("... with a bias in the training data, here only of angles from -pi to 0", of_half)
+        yield _two_regions("the profile is asymmetric, and poor around pi/2 and -pi/2", profiles)
+        yield _two_regions("... with this bias in the training data", of_half)
+        yield Claim(
+            f"CCDT is largest near a goal of {PAPERS_GOAL} rad",
+            f"largest at {ranged(farthest, 2)} rad, where it is {ranged(ccdt, 2)}",
+            agreement(max(abs(goal - PAPERS_GOAL) for goal in farthest) < 0.1),
+        )
+        yield Claim(
+            "OLDT and OLCD are flat, and much higher than CCDT and CuSTOM",
+            f"OLDT {spread(oldt)[0]:.1f}, OLCD {spread(olcd)[0]:.1f} with |u| <= {trials[0]['bound']:g} N m, a "
+            f"bound of ours, without which there is no maximum: at least {over:.0f} times the closed-loop "
+            f"maximum; median restart within {max(gaps):.1f} % of the best",
+            agreement(bool(over > 2)),
+        )
 
 
 def _worst_goal(paper: str, profiles: list[tuple[Array, Array]]) -> Claim:
@@ -141,26 +139,24 @@ class Trajectories(Study):
         values = [model.times.tolist(), *model.states.T.tolist(), *system.states.T.tolist()]
         return dict(zip(names, values, strict=True))
 
-    def claims(self, results: Results, scale: Scale) -> list[Claim]:
+    def claims(self, results: Results, scale: Scale) -> Iterator[Claim]:
         trials = [results[job] for job in self.jobs(scale)]
         names = ("apart", "end", "model_undershoot", "system_undershoot")
         apart, end, model, system = ([trial[name] for trial in trials] for name in names)
         larger = sum(s > m + 0.01 for m, s in zip(model, system, strict=True))
-        return [
-            Claim(
-                f"at a goal of {PAPERS_GOAL} rad, M and S move differently but reach the same final state",
-                f"they are {ranged(apart, 2)} apart on the way and {ranged(end, 3)} at the end",
-                agreement(spread(end)[0] < 0.1 * spread(apart)[0], spread(end)[0] < spread(apart)[0]),
-            ),
-            Claim(
-                "the controller leads to a larger undershoot on S than on M",
-                f"the angle goes {ranged(np.maximum(system, 0.0), 3)} rad below the goal on S and "
-                f"{ranged(np.maximum(model, 0.0), 3)} rad on M; more than 0.01 rad farther on S in {larger} of "
-                f"{len(trials)} trials",
-                agreement(larger > len(trials) / 2, larger > 0),
-                "the weight of the rate damps the loops, so that neither of them goes below the goal",
-            ),
-        ]
+        yield Claim(
+            f"at a goal of {PAPERS_GOAL} rad, M and S move differently but reach the same final state",
+            f"they are {ranged(apart, 2)} apart on the way and {ranged(end, 3)} at the end",
+            agreement(spread(end)[0] < 0.1 * spread(apart)[0], spread(end)[0] < spread(apart)[0]),
+        )
+        yield Claim(
+            "the controller leads to a larger undershoot on S than on M",
+            f"the angle goes {ranged(np.maximum(system, 0.0), 3)} rad below the goal on S and "
+            f"{ranged(np.maximum(model, 0.0), 3)} rad on M; more than 0.01 rad farther on S in {larger} of "
+            f"{len(trials)} trials",
+            agreement(larger > len(trials) / 2, larger > 0),
+            "the weight of the rate damps the loops, so that neither of them goes below the goal",
+        )
 
 
 class Techniques(Study):
@@ -205,7 +201,7 @@ class Techniques(Study):
             columns |= zip(names, quartiles.tolist(), strict=True)
         return columns
 
-    def claims(self, results: Results, scale: Scale) -> list[Claim]:
+    def claims(self, results: Results, scale: Scale) -> Iterator[Claim]:
         names = (*TECHNIQUES, *INFORMED)
         errors = {name: self.errors(results, scale, name) for name in names}
         ucb, sc, sd = (np.median(errors[name], axis=0) for name in TECHNIQUES)
@@ -216,48 +212,45 @@ class Techniques(Study):
         as_near = int((errors["random"][:, -1] <= ucb[19]).sum())
         profiles = [results[job]["custom"] for job in FourFrameworks().jobs(scale)[: scale.trials]]
         broad = 100 * np.median([np.mean(np.array(d) >= (1 - _NEAR / 100) * max(d)) for d in profiles])
-        return [
-            Claim(
-                "CuSTOM is within 1 % after 3 samples beyond five common first ones, and at 0 % by 20",
-                f"within 1 % after {beyond['gp-ucb']} beyond the five; median error at 20: {ucb[19]:.4f} %",
-                agreement(median["gp-ucb"] <= 3 and ucb[19] < 0.05, median["gp-ucb"] <= 3 or ucb[19] < 0.05),
-            ),
-            Claim(
-                f"SC is within {_NEAR} % only after 60 samples",
-                f"within {_NEAR} % after {near:g}; median error {sc[19]:.2f} % at 20, {sc[59]:.2f} % at 60",
-                agreement(30 <= near <= 90, near > median["gp-ucb"] + _COMMON),
-                f"random samples fall near a broad maximum sooner: {broad:.1f} % of the goals "
-                f"are within {_NEAR} % of d*",
-            ),
-            Claim(
-                "SC does not find the maximum even in 100 samples",
-                f"median error {sc[99]:.4f} % at 100; {as_near} of {scale.trials} trials are as near as CuSTOM at 20",
-                agreement(sc[99] > ucb[19]),
-            ),
-            Claim(
-                f"SD is not close even after 100 samples (the paper calls SC close from {_NEAR} % on)",
-                f"median error {sd[59]:.1f} % at 60, {sd[99]:.1f} % at 100",
-                agreement(sd[99] > _NEAR, sd[59] > _NEAR),
-                "the sixth largest of 100 samples is near a broad maximum too",
-            ),
-            Claim(
-                "CuSTOM and SC outperform SD",
-                f"median errors at 100: {ucb[99]:.4f} %, {sc[99]:.4f} %, {sd[99]:.1f} %",
-                agreement(max(ucb[99], sc[99]) < sd[99], min(ucb[99], sc[99]) < sd[99]),
-            ),
-            Claim(
-                "a prior mean generally leads to a faster convergence, here the distance of another trial's model",
-                f"within 1 % after {beyond['gp-ucb-prior-mean']} beyond the five, against {beyond['gp-ucb']}",
-                agreement(median["gp-ucb-prior-mean"] < median["gp-ucb"]),
-                "the other model is worst at another goal",
-            ),
-            Claim(
-                "a prior of the hyperparameters helps (Algorithm 1), here a length-scale near that of another trial",
-                f"within 1 % after {beyond['gp-ucb-hyperprior']} beyond the five, against {beyond['gp-ucb']}",
-                agreement(median["gp-ucb-hyperprior"] <= median["gp-ucb"]),
-                "a few values teach the length-scale, and that of another trial differs",
-            ),
-        ]
+        yield Claim(
+            "CuSTOM is within 1 % after 3 samples beyond five common first ones, and at 0 % by 20",
+            f"within 1 % after {beyond['gp-ucb']} beyond the five; median error at 20: {ucb[19]:.4f} %",
+            agreement(median["gp-ucb"] <= 3 and ucb[19] < 0.05, median["gp-ucb"] <= 3 or ucb[19] < 0.05),
+        )
+        yield Claim(
+            f"SC is within {_NEAR} % only after 60 samples",
+            f"within {_NEAR} % after {near:g}; median error {sc[19]:.2f} % at 20, {sc[59]:.2f} % at 60",
+            agreement(30 <= near <= 90, near > median["gp-ucb"] + _COMMON),
+            f"random samples fall near a broad maximum sooner: {broad:.1f} % of the goals are within {_NEAR} % of d*",
+        )
+        yield Claim(
+            "SC does not find the maximum even in 100 samples",
+            f"median error {sc[99]:.4f} % at 100; {as_near} of {scale.trials} trials are as near as CuSTOM at 20",
+            agreement(sc[99] > ucb[19]),
+        )
+        yield Claim(
+            f"SD is not close even after 100 samples (the paper calls SC close from {_NEAR} % on)",
+            f"median error {sd[59]:.1f} % at 60, {sd[99]:.1f} % at 100",
+            agreement(sd[99] > _NEAR, sd[59] > _NEAR),
+            "the sixth largest of 100 samples is near a broad maximum too",
+        )
+        yield Claim(
+            "CuSTOM and SC outperform SD",
+            f"median errors at 100: {ucb[99]:.4f} %, {sc[99]:.4f} %, {sd[99]:.1f} %",
+            agreement(max(ucb[99], sc[99]) < sd[99], min(ucb[99], sc[99]) < sd[99]),
+        )
+        yield Claim(
+            "a prior mean generally leads to a faster convergence, here the distance of another trial's model",
+            f"within 1 % after {beyond['gp-ucb-prior-mean']} beyond the five, against {beyond['gp-ucb']}",
+            agreement(median["gp-ucb-prior-mean"] < median["gp-ucb"]),
+            "the other model is worst at another goal",
+        )
+        yield Claim(
+            "a prior of the hyperparameters helps (Algorithm 1), here a length-scale near that of another trial",
+            f"within 1 % after {beyond['gp-ucb-hyperprior']} beyond the five, against {beyond['gp-ucb']}",
+            agreement(median["gp-ucb-hyperprior"] <= median["gp-ucb"]),
+            "a few values teach the length-scale, and that of another trial differs",
+        )
 
 
 class ConvergedGP(Study):
@@ -286,9 +279,8 @@ class ConvergedGP(Study):
         axes.plot(x[:5], y[:5], **marks, color="white", label="first samples")
         axes.plot(x[5:], y[5:], **marks, color=study.BLACK, label="acquired samples")
         best = y.argmax()
-        axes.plot(
-            x[best], y[best], "*", color=study.ORANGE, markeredgecolor=study.BLACK, markersize=14, label="maximum found"
-        )
+        found = marks | {"marker": "*", "markersize": 14, "label": "maximum found"}
+        axes.plot(x[best], y[best], **found, color=study.ORANGE)
         axes.grid(False)
 
     def data(self, results: Results, scale: Scale) -> Columns:
@@ -299,16 +291,14 @@ class ConvergedGP(Study):
         known = {"goal_rad": curve["points"], "true_distance": curve["distances"]}
         return known | {"gp_mean": mean.tolist(), "gp_standard_deviation": deviation.tolist()}
 
-    def claims(self, results: Results, scale: Scale) -> list[Claim]:
+    def claims(self, results: Results, scale: Scale) -> Iterator[Claim]:
         goals, truth, mean, deviation = (np.array(column) for column in self.data(results, scale).values())
         inside = np.abs(truth - mean) <= 1.96 * deviation + 1e-9
         near = np.abs(goals - goals[truth.argmax()]) < 0.3
         gap = 100 * np.abs(mean - truth)[near].max() / truth.max()
-        return [
-            Claim(
-                "the GP does not hold the whole truth in its 95 % band, but it holds the region of the maximum",
-                f"{100 * inside.mean():.0f} % of the goals are inside the band; within 0.3 rad of the maximum the mean "
-                f"is at most {gap:.2f} % of d* off",
-                agreement(gap < 5 and not inside.all(), gap < 5),
-            )
-        ]
+        yield Claim(
+            "the GP does not hold the whole truth in its 95 % band, but it holds the region of the maximum",
+            f"{100 * inside.mean():.0f} % of the goals are inside the band; within 0.3 rad of the maximum the mean "
+            f"is at most {gap:.2f} % of d* off",
+            agreement(gap < 5 and not inside.all(), gap < 5),
+        )

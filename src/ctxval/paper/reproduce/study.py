@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -57,35 +57,25 @@ def agreement(whole: bool, part: bool = False) -> Agreement:
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim of the paper, with the measured numbers, and whether they agree with it.
-
-    The remark is the reason for a difference, if known; it is shown only if the numbers do not agree.
-    """
+    """One claim of the paper, with the measured numbers, and whether they agree with it."""
 
     paper: str
     measured: str
     agrees: Agreement
-    remark: str = ""
+    remark: str = ""  #: the reason for a difference, if known; it is shown only if the numbers do not agree
 
 
 Columns = dict[str, Sequence[float | str]]  #: the data behind a figure, as columns of equal length
 
 
 class Study(ABC):
-    """One figure of the paper.
+    """One figure of the paper."""
 
-    Attributes:
-        name: its name on the command line, and the name of its files.
-        case: the case that it runs on.
-        axes: the labels of the two axes.
-        legend: the number of columns of the legend.
-    """
-
-    name: str
+    name: str  #: its name on the command line, and the name of its files
     title: str
-    case: str
-    axes: tuple[str, str] = ("executions of S", "")
-    legend = 2
+    case: str  #: the case that it runs on
+    axes: tuple[str, str] = ("executions of S", "")  #: the labels of the two axes
+    legend = 2  #: the number of columns of the legend
 
     @abstractmethod
     def jobs(self, scale: Scale) -> list[Job]:
@@ -99,16 +89,14 @@ class Study(ABC):
         """Return the numbers that the figure shows."""
 
     @abstractmethod
-    def claims(self, results: Results, scale: Scale) -> list[Claim]:
+    def claims(self, results: Results, scale: Scale) -> Iterable[Claim]:
         """Return the paper's claims about the figure, with the measured numbers."""
 
     def draw(self, results: Results, scale: Scale) -> Figure:
         from matplotlib.figure import Figure  # imported here, because only figures need it
 
         figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-        axes = figure.add_subplot()
-        axes.set_xlabel(self.axes[0])
-        axes.set_ylabel(self.axes[1])
+        axes = figure.add_subplot(xlabel=self.axes[0], ylabel=self.axes[1])
         axes.grid(alpha=0.25)
         self.fill(axes, results, scale)
         figure.legend(loc="outside upper center", ncols=self.legend, fontsize=8)
@@ -135,7 +123,6 @@ class ExecutionsWithin(Study):
         """Return the number of executions of a technique."""
 
     def jobs(self, scale: Scale) -> list[Job]:
-        """Return one campaign for each technique, set of options and trial, and the truths."""
         different = dict.fromkeys(place.options for place in self.places)
         runs = [(options, seed) for options in different for seed in scale.seeds]
         searches = [self._job(search, *run, scale) for search in ("gp-ucb", "random") for run in runs]
@@ -167,7 +154,6 @@ class ExecutionsWithin(Study):
         axes.plot([], [], "^", color=BLACK, fillstyle="none", label="not within the budget")
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        """Return median, smallest and largest value for each technique and place."""
         columns: Columns = {self.column: [place.x for place in self.places]}
         for search in TECHNIQUES:
             spreads = np.array([spread(row) for row in self.executions(results, scale, search)])
@@ -187,12 +173,8 @@ def draw_quartiles(axes: Axes, rows: dict[str, Array]) -> None:
 
 
 def running_estimate(distances: Sequence[float] | Array, search: str) -> Array:
-    """Return the estimates of d* after 1, 2, ... executions: the largest distance, or the largest one that SD keeps.
-
-    The estimate is NaN until there is one. Failed executions count as executions and do not change the estimate.
-    """
-    discard = DISCARDED if search == "sampling-discarding" else 0
-    largest: list[float] = []
+    """Return the largest distance, or the largest that SD keeps, after 1, 2, ... executions; NaN until there is one."""
+    discard, largest = DISCARDED if search == "sampling-discarding" else 0, list[float]()
     estimates = np.full(len(distances), np.nan)
     for k, distance in enumerate(distances):
         if not np.isnan(distance):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,17 +12,7 @@ from ctxval.core.soundness import MISSED
 from ctxval.paper.cases import arm, dubins
 from ctxval.paper.reproduce import study
 from ctxval.paper.reproduce.jobs import Job, Result, Results, distances_of
-from ctxval.paper.reproduce.study import (
-    TECHNIQUES,
-    Claim,
-    Columns,
-    ExecutionsWithin,
-    Place,
-    Scale,
-    Study,
-    agreement,
-    spread,
-)
+from ctxval.paper.reproduce.study import TECHNIQUES, Claim, Columns, ExecutionsWithin, Scale, Study, agreement, spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,7 +36,7 @@ class ArmSamples(ExecutionsWithin):
     case = "arm"
     axes = "within so many per cent of d*", "executions of S, median"
     column = "percent"
-    places = tuple(Place(percent, (("model", "fnn"),), percent) for percent in (20.0, 15.0, 10.0, 5.0, 2.0, 1.0))
+    places = tuple(study.Place(percent, (("model", "fnn"),), percent) for percent in (20.0, 15.0, 10.0, 5.0, 2.0, 1.0))
     dodge = 0.3
 
     def budget(self, search: str, scale: Scale) -> int:
@@ -55,18 +46,16 @@ class ArmSamples(ExecutionsWithin):
         super().fill(axes, results, scale)
         axes.invert_xaxis()
 
-    def claims(self, results: Results, scale: Scale) -> list[Claim]:
+    def claims(self, results: Results, scale: Scale) -> Iterator[Claim]:
         ucb, sc = (spread(self.executions(results, scale, search)[-2]) for search in ("gp-ucb", "random"))  # 2 %
         median, low, high = (study.counted(value, _ARM) for value in ucb)
-        return [
-            Claim(
-                "CuSTOM is within 2 % of d* in under 50 executions, far ahead of the baselines",
-                f"median {median} (from {low} to {high}); SC {study.counted(sc[0], _RANDOM)}",
-                agreement(ucb[0] < 50 and sc[0] > ucb[0], sc[0] > ucb[0]),
-                "the distance of the network, piecewise linear inside, has many kinks and narrow peaks; with the other "
-                "two models it takes fewer",
-            )
-        ]
+        yield Claim(
+            "CuSTOM is within 2 % of d* in under 50 executions, far ahead of the baselines",
+            f"median {median} (from {low} to {high}); SC {study.counted(sc[0], _RANDOM)}",
+            agreement(ucb[0] < 50 and sc[0] > ucb[0], sc[0] > ucb[0]),
+            "the distance of the network, piecewise linear inside, has many kinks and narrow peaks; with the other "
+            "two models it takes fewer",
+        )
 
 
 class ArmModels(Study):
@@ -96,7 +85,6 @@ class ArmModels(Study):
         axes.set_ylim(bottom=0)
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        """Return, for each model and trial, d* and the final distances of model and system from their targets."""
         pairs = [(model, seed) for model in MODELS for seed in scale.seeds]
         columns: Columns = {"model": [model for model, _ in pairs], "seed": [float(seed) for _, seed in pairs]}
         columns["d_star_m"] = [results[self._job("truth", *pair)]["distance"] for pair in pairs]
@@ -106,42 +94,37 @@ class ArmModels(Study):
             columns[f"{side}_to_target_max_m"] = [float(np.max(error)) for error in errors]
         return columns
 
-    def claims(self, results: Results, scale: Scale) -> list[Claim]:
+    def claims(self, results: Results, scale: Scale) -> Iterator[Claim]:
         seeds = scale.seeds
         worst = {m: [results[self._job("truth", m, s)]["distance"] for s in seeds] for m in MODELS}
         aspects: dict[str, list[Result]] = {m: [results[self._job("aspects", m, s)] for s in seeds] for m in MODELS}
         reached = {m: [float(np.median(a["system_error"])) for a in aspects[m]] for m in MODELS}
         missed_by = {m: [float(np.median(a["model_error"])) for a in aspects[m]] for m in MODELS}
         missed, near = [spread(missed_by[m])[0] for m in MODELS], MISSED * float(np.ptp(arm.Settings().z))
-        within = {
-            m: [
-                study.executions_within(distances_of(results[self._job("search", m, s)]), "gp-ucb", worst[m][s], 2.0)
-                for s in seeds
-            ]
-            for m in MODELS
-        }
-        return [
-            Claim(
-                "CuSTOM finds d* within a few samples for every model",
-                "within 2 % after "
-                + ", ".join(f"{study.counted(spread(within[m])[0], _ARM)} ({MODELS[m][0]})" for m in MODELS),
-                agreement(max(spread(row)[0] for row in within.values()) < 50, spread(within["gp"])[0] < 50),
-            ),
-            _order("by d*, the distance between M and S", "the GP is the best model, the linear one the worst", worst),
-            _order(
-                "by the system's distance to its target (median over the table)",
-                "... in the sense that its controller takes the system closest to the target",
-                reached,
-            ),
-            Claim(
-                "the model itself performs its tasks (Remark 1, Aspect 1)",
-                "the model itself ends "
-                + ", ".join(f"{1000 * spread(missed_by[m])[0]:.2f} mm ({MODELS[m][0]})" for m in MODELS)
-                + f" from its target, median over the table; {1000 * near:.0f} mm are {100 * MISSED:g} % of its side",
-                agreement(max(missed) < near, min(missed) < near),
-                "the other models do not even complete their own tasks, so that d* of these says little",
-            ),
-        ]
+        within: dict[str, list[float]] = {m: [] for m in MODELS}
+        for m, s in ((m, s) for m in MODELS for s in seeds):
+            distances = distances_of(results[self._job("search", m, s)])
+            within[m].append(study.executions_within(distances, "gp-ucb", worst[m][s], 2.0))
+        yield Claim(
+            "CuSTOM finds d* within a few samples for every model",
+            "within 2 % after "
+            + ", ".join(f"{study.counted(spread(within[m])[0], _ARM)} ({MODELS[m][0]})" for m in MODELS),
+            agreement(max(spread(row)[0] for row in within.values()) < 50, spread(within["gp"])[0] < 50),
+        )
+        yield _order("by d*, the distance between M and S", "the GP is the best model, the linear one the worst", worst)
+        yield _order(
+            "by the system's distance to its target (median over the table)",
+            "... in the sense that its controller takes the system closest to the target",
+            reached,
+        )
+        yield Claim(
+            "the model itself performs its tasks (Remark 1, Aspect 1)",
+            "the model itself ends "
+            + ", ".join(f"{1000 * spread(missed_by[m])[0]:.2f} mm ({MODELS[m][0]})" for m in MODELS)
+            + f" from its target, median over the table; {1000 * near:.0f} mm are {100 * MISSED:g} % of its side",
+            agreement(max(missed) < near, min(missed) < near),
+            "the other models do not even complete their own tasks, so that d* of these says little",
+        )
 
 
 def _order(measure: str, paper: str, values: dict[str, list[float]]) -> Claim:
@@ -191,7 +174,7 @@ class DubinsMedians(Study):
             columns[f"{search}_median"] = [*median.tolist(), *[""] * (_RANDOM - len(median))]  # empty after the budget
         return columns
 
-    def claims(self, results: Results, scale: Scale) -> list[Claim]:
+    def claims(self, results: Results, scale: Scale) -> Iterator[Claim]:
         seeds = scale.seeds
         final = {search: self.estimates(results, scale, search)[:, -1] for search in TECHNIQUES}
         truths = np.array([results[Job("truth", "dubins", seed)]["distance"] for seed in seeds])
@@ -207,40 +190,38 @@ class DubinsMedians(Study):
         root = np.sqrt(dubins.Settings().horizon)
         # The paper finds about 3.5 m, and its random samples stay below all thresholds of 2 to 3 m.
         printed, square = (abs(factor * high - 3.5) < 0.5 and factor * low < 2 for factor in (1.0, root))
-        return [
-            Claim(
-                "CuSTOM is at its maximum in 100 samples",
-                f"after {_CAR} executions GP-UCB is at {study.ranged(share, 0)} % of the best-known value",
-                agreement(spread(share)[0] > 95, spread(share)[0] > 80),
-                "its maximum is not the maximum: a large search finds more",
-            ),
-            Claim(
-                "CuSTOM is above SC and SD even at 500 samples",
-                f"median {high:.4g} after {_CAR}, against SC {np.median(sc):.4g} and SD {np.median(sd):.4g} after "
-                f"{_RANDOM}; above both in {wins} of {scale.trials} trials",
-                agreement(high > low and wins > scale.trials / 2, high > low),
-            ),
-            Claim(
-                "a threshold exists at which SC and SD certify falsely",
-                f"any between {low:.4g} and {np.median(truths):.4g}: SC and SD stay below it, and d* does not",
-                agreement(low < float(np.median(truths))),
-            ),
-            Claim(
-                "the average deviation is at most 3.5 m; at a threshold of 2 to 3 m SC and SD certify falsely",
-                f"as the formula is printed, CuSTOM finds {high:.2f} m and the random samples {low:.2f} m; as a root "
-                f"mean square, {root:g} times as much: {root * high:.1f} m and {root * low:.1f} m",
-                agreement(printed, square),
-                "the numbers of the paper are root mean squares; its formula divides by H instead of the root of H",
-            ),
-            Claim(
-                "the model itself performs its tasks (Remark 1, Aspect 1)",
-                f"the mean distance from the reference is {study.ranged(model, 2)} m on the model and "
-                f"{study.ranged(system, 2)} m on the system (median over {_TASKS} random tasks), against "
-                f"{spread(size)[0]:.2f} m straight ahead",
-                agreement(float(missed.max()) < MISSED, float(missed.min()) < MISSED),
-                "the reference has the heading 0, which is not that of its waves, so that LQR trades one for the other",
-            ),
-        ]
+        yield Claim(
+            "CuSTOM is at its maximum in 100 samples",
+            f"after {_CAR} executions GP-UCB is at {study.ranged(share, 0)} % of the best-known value",
+            agreement(spread(share)[0] > 95, spread(share)[0] > 80),
+            "its maximum is not the maximum: a large search finds more",
+        )
+        yield Claim(
+            "CuSTOM is above SC and SD even at 500 samples",
+            f"median {high:.4g} after {_CAR}, against SC {np.median(sc):.4g} and SD {np.median(sd):.4g} after "
+            f"{_RANDOM}; above both in {wins} of {scale.trials} trials",
+            agreement(high > low and wins > scale.trials / 2, high > low),
+        )
+        yield Claim(
+            "a threshold exists at which SC and SD certify falsely",
+            f"any between {low:.4g} and {np.median(truths):.4g}: SC and SD stay below it, and d* does not",
+            agreement(low < float(np.median(truths))),
+        )
+        yield Claim(
+            "the average deviation is at most 3.5 m; at a threshold of 2 to 3 m SC and SD certify falsely",
+            f"as the formula is printed, CuSTOM finds {high:.2f} m and the random samples {low:.2f} m; as a root "
+            f"mean square, {root:g} times as much: {root * high:.1f} m and {root * low:.1f} m",
+            agreement(printed, square),
+            "the numbers of the paper are root mean squares; its formula divides by H instead of the root of H",
+        )
+        yield Claim(
+            "the model itself performs its tasks (Remark 1, Aspect 1)",
+            f"the mean distance from the reference is {study.ranged(model, 2)} m on the model and "
+            f"{study.ranged(system, 2)} m on the system (median over {_TASKS} random tasks), against "
+            f"{spread(size)[0]:.2f} m straight ahead",
+            agreement(float(missed.max()) < MISSED, float(missed.min()) < MISSED),
+            "the reference has the heading 0, which is not that of its waves, so that LQR trades one for the other",
+        )
 
 
 class LinearComplexity(ExecutionsWithin):
@@ -251,27 +232,22 @@ class LinearComplexity(ExecutionsWithin):
     case = "linear"
     axes = "dimension of the task space", "executions until within 5 % of d*, median"
     column = "dimension"
-    places = tuple(Place(2.0 * states, (("dim", states),), 5.0) for states in range(1, 11))
+    places = tuple(study.Place(2.0 * states, (("dim", states),), 5.0) for states in range(1, 11))
     dodge = 0.25
 
     def budget(self, search: str, scale: Scale) -> int:
         return 100 if search == "gp-ucb" else scale.of(20_000)
 
-    def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        medians = {
-            search: [spread(row)[0] for row in self.executions(results, scale, search)[[0, 4, -1]]]
-            for search in TECHNIQUES
-        }
-        texts = [
-            f"{TECHNIQUES[search][0]}: " + ", ".join(study.counted(value, self.budget(search, scale)) for value in row)
-            for search, row in medians.items()
-        ]
+    def claims(self, results: Results, scale: Scale) -> Iterator[Claim]:
+        medians, texts = dict[str, list[float]](), list[str]()
+        for search, (label, *_) in TECHNIQUES.items():
+            medians[search] = [spread(row)[0] for row in self.executions(results, scale, search)[[0, 4, -1]]]
+            counts = (study.counted(value, self.budget(search, scale)) for value in medians[search])
+            texts.append(f"{label}: {', '.join(counts)}")
         ucb, sc = medians["gp-ucb"], medians["random"]
         # The largest dimension is 10 times the smallest one, so a growth up to this ratio is at most linear.
-        return [
-            Claim(
-                "growth with the dimension is modest for CuSTOM, drastic for SC and SD (within 5 %)",
-                f"executions in 2-D, 10-D, 20-D: {'; '.join(texts)}",
-                agreement(ucb[2] / ucb[0] <= 10 and sc[2] / sc[0] > 10 * ucb[2] / ucb[0], sc[2] > ucb[2]),
-            )
-        ]
+        yield Claim(
+            "growth with the dimension is modest for CuSTOM, drastic for SC and SD (within 5 %)",
+            f"executions in 2-D, 10-D, 20-D: {'; '.join(texts)}",
+            agreement(ucb[2] / ucb[0] <= 10 and sc[2] / sc[0] > 10 * ucb[2] / ucb[0], sc[2] > ucb[2]),
+        )
