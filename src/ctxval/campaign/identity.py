@@ -68,7 +68,7 @@ def described_plainly(value: Any) -> Any:
 
 
 def with_distance(description: dict[str, Any], distance: Any) -> dict[str, Any]:
-    """Return a description with the description of another distance."""
+    """Return a description with that of another distance."""
     return {**description, "validation": {**description["validation"], "distance": distance}}
 
 

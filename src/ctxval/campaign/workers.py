@@ -210,8 +210,7 @@ class ProcessPool(WorkerPool):
     def _received(self, worker: _Worker) -> Execution:
         """Return what an execution gave: if its process has ended, a failure if the system ended it, else a loss."""
         try:
-            execution: Execution = pickle.loads(worker.pipe.recv_bytes())
-            return execution
+            return pickle.loads(worker.pipe.recv_bytes())  # type: ignore[no-any-return]
         except (EOFError, OSError, pickle.UnpicklingError):
             self._stop([worker])
         status = worker.process.exitcode

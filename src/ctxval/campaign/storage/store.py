@@ -134,11 +134,10 @@ class Store(Database):
 
     def keep_settings(self, settings: dict[str, Any]) -> None:
         """Store the settings that make the experiment again, for commands that get only the store."""
-        if self.settings() == json.loads(json.dumps(settings)):
-            return
-        with self._transaction():
-            self._execute("DELETE FROM settings")
-            self._insert_pairs("settings", settings)
+        if self.settings() != json.loads(json.dumps(settings)):
+            with self._transaction():
+                self._execute("DELETE FROM settings")
+                self._insert_pairs("settings", settings)
 
     def settings(self) -> dict[str, Any]:
         """Return the settings that make the experiment again; empty if no command made the store."""
@@ -214,9 +213,8 @@ class Store(Database):
                 row = row_of(trial)
                 values = (*row, checksum_of(row), now(), None if trial.state == "open" else now())
                 places = ", ".join("?" * len(values))
-                self._execute(
-                    f"INSERT INTO trials ({COLUMNS}, checksum, opened_at, closed_at) VALUES ({places})", values
-                )
+                columns = f"{COLUMNS}, checksum, opened_at, closed_at"
+                self._execute(f"INSERT INTO trials ({columns}) VALUES ({places})", values)
                 self._write_trajectory(trial.number, "model", model_trajectory)
                 self._write_trajectory(trial.number, "system", system_trajectory)
 
@@ -257,11 +255,10 @@ class Store(Database):
         row = dict(zip(COLUMNS.split(", "), row_of(trial), strict=True))
         values = (*(row[name] for name in columns), checksum_of(row_of(trial)), closed_at, trial.number)
         assignments = f"{' = ?, '.join(columns)} = ?, checksum = ?, closed_at = coalesce(?, closed_at)"
-        if self._execute(f"UPDATE trials SET {assignments} WHERE number = ? {where}", values).rowcount == 1:
-            return
-        row = self._execute("SELECT state FROM trials WHERE number = ?", (trial.number,)).fetchone()
-        state = "not open" if row is None else "being executed by another process" if row[0] == "open" else row[0]
-        raise InputError(f"trial {trial.number} is {state}, so nothing more can be told of it.")
+        if self._execute(f"UPDATE trials SET {assignments} WHERE number = ? {where}", values).rowcount != 1:
+            row = self._execute("SELECT state FROM trials WHERE number = ?", (trial.number,)).fetchone()
+            state = "not open" if row is None else "being executed by another process" if row[0] == "open" else row[0]
+            raise InputError(f"trial {trial.number} is {state}, so nothing more can be told of it.")
 
     def trials(self) -> list[Trial]:
         """Return all trials in their order. Raises a :class:`ForeignStoreError` if one is damaged."""
@@ -269,7 +266,8 @@ class Store(Database):
         with self._rows(f"SELECT {COLUMNS}, checksum FROM trials ORDER BY number") as cursor:
             for *row, checksum in cursor:
                 trial = read_trial(tuple(row), checksum)
-                if trial is None or not rows.follows(trial, trials):
+                fits = trial is not None and (not trials or trial.unit_point.shape == trials[0].unit_point.shape)
+                if trial is None or trial.number != len(trials) or not fits:
                     raise self._damaged(f"its trial {len(trials)} cannot be read")
                 trials.append(trial)
         return trials
@@ -343,15 +341,13 @@ class Store(Database):
                     self._memory += _size(self._kept.pop(number)[1])
         executed = dict[int, Trajectory]()
         for number in numbers:
-            if number not in self._kept:
-                checksum, trajectory = self._read_trajectory(number, side)
-                if _size(trajectory) <= self._memory:  # to drop an older one would not help: all are read in turn
-                    self._memory -= _size(trajectory)
-                    self._kept[number] = checksum, trajectory
-                    for array in () if trajectory is None else (trajectory.times, trajectory.states, trajectory.inputs):
-                        array.setflags(write=False)
-            else:
-                trajectory = self._kept[number][1]
+            checksum, trajectory = self._kept.get(number) or self._read_trajectory(number, side)
+            # To drop an older one would not help: all are read in turn.
+            if number not in self._kept and _size(trajectory) <= self._memory:
+                self._memory -= _size(trajectory)
+                self._kept[number] = checksum, trajectory
+                for array in () if trajectory is None else (trajectory.times, trajectory.states, trajectory.inputs):
+                    array.setflags(write=False)
             if trajectory is not None:
                 executed[number] = trajectory
         return executed
