@@ -260,7 +260,7 @@ def _hashed(tree: Any) -> str:
 
 
 def _plain(node: Any, *, top: bool = False, bare: bool = False) -> Any:
-    """Return a tree as tuples, without docstrings, and if it is bare without imports and any text that stands alone.
+    """Return a tree as tuples without docstrings, bare also without imports and texts that stand alone.
 
     Empty fields are left out, so that every version of Python gives the same tuples.
     """

@@ -211,10 +211,7 @@ def _rest(count: int) -> list[str]:
 
 
 def table(title: str, rows: Iterable[tuple[str, object]]) -> str:
-    """Return a plain HTML table of two columns; rows whose value is None are left out.
-
-    It sets no colours, so that it is legible on light and dark pages. Every text is escaped.
-    """
+    """Return an HTML table of two columns without colours of its own, without rows of None, and with escaped texts."""
     style = "text-align:left;color:inherit;background:transparent"
     cell = f"{style};vertical-align:top;padding:0.2em 0.8em 0.2em 0.2em;border-bottom:1px solid currentColor"
 

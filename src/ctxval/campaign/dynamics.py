@@ -129,10 +129,7 @@ class CampaignDynamics:
             return None
 
     def predict(self, trials: Sequence[Trial], point: Array, *, alone: bool = False) -> ExecutionPrediction | None:
-        """Return the prediction of an execution at a point ``(d,)`` of the unit cube; None if there is none.
-
-        It is learned from completed trials, with ``alone`` from no other recordings.
-        """
+        """Return the prediction at a point ``(d,)``, with ``alone`` from trials alone; None if there is none."""
         try:
             with stage("predicting the execution", unit="closed loops"):
                 learned = self.learned(trials, alone=alone)
@@ -160,10 +157,7 @@ class CampaignDynamics:
                 return None
 
     def evidence(self, trials: Sequence[Trial], confidence: float, *, keep: bool = False) -> DynamicsEvidence | None:
-        """Return what the learned dynamics say about d*, with a confidence; None if nothing can be learned.
-
-        With ``keep``, the store keeps it with the trials that it follows from.
-        """
+        """Return what the learned dynamics say about d*, which the store may keep; None if nothing can be learned."""
         kept = self.kept_evidence(trials, confidence)
         if kept is not None:
             return kept
@@ -259,10 +253,7 @@ class CampaignDynamics:
         )
 
     def checked(self, trials: Sequence[Trial]) -> tuple[CheckedPrediction, ...]:
-        """Return the predictions of completed trials; of those without a stored one, of the last few only.
-
-        The first trials, before which nothing could be learned, have no prediction.
-        """
+        """Return the predictions of completed trials; of those without a stored one, of the last few that have any."""
         completed = [trial for trial in trials if trial.state == "completed" and trial.distance is not None]
         checked = []
         for place, trial in enumerate(completed):
@@ -309,10 +300,7 @@ class LearnedFromTrials:
     _predictions: dict[int, Prediction | None] = field(default_factory=dict, init=False)
 
     def expected(self, points: Array, before: int) -> Array:
-        """Return predicted distances ``(m,)`` at points ``(m, d)``, learned from the trials with smaller numbers.
-
-        They are NaN if a task cannot be predicted, or if the trials teach nothing.
-        """
+        """Return distances ``(m,)`` at points ``(m, d)`` predicted from trials with smaller numbers; NaN if unknown."""
         if before not in self._predictions:
             earlier = [trial for trial in self.trials if trial.number < before]
             self._predictions[before] = self.study.prediction(earlier)

@@ -60,10 +60,7 @@ class ExecutionLoop:
         self.stopped: BaseException | None = None
 
     def run(self) -> None:
-        """Execute to the end, as the only process that runs the store.
-
-        If an error or Ctrl-C stops the loop, it first waits for the running executions, which were paid for.
-        """
+        """Execute to the end, alone on the store; after an error or Ctrl-C, running executions are waited for."""
         recorder = self.recorder
         with recorder.store.sole_writer(), Interrupts() as interrupts, exits_as_exceptions():
             recorder.refresh()

@@ -57,10 +57,7 @@ class Steadiness:
         return sum(not steady for steady in self._tested.values())
 
     def __call__(self, point: Array) -> bool:
-        """Return whether rounding a task ``(d,)``, or moving it by 1e-9 of its ranges, hardly changes its distance.
-
-        After too many tests it is false, and the task does not count as rejected.
-        """
+        """Return whether rounding a task ``(d,)``, or moving it by 1e-9 of its ranges, hardly changes its distance."""
         key, space = point.tobytes(), self.planner.validation.space
         if space.members is not None:
             return True  # there are no tasks next to it
@@ -94,10 +91,7 @@ class Steadiness:
         return point if steady is None else steady
 
     def _pushed_loops(self, points: Array) -> Array:
-        """Return the states of M, disturbed by 1 % of their ranges in each step, as shares of these ranges.
-
-        The shape is ``(m, (H + 1) n)``; NaN if the loop of a task is not known.
-        """
+        """Return states ``(m, (H + 1) n)`` of M pushed by 1 % of their ranges a step, as shares of these; else NaN."""
         model, pushed = self.planner.validation.model, list[tuple[Rows, Array]]()
         for planned in self.planner.plan(points):
             ranges = np.ptp(planned.promised.states.reshape(-1, planned.promised.states.shape[-1]), axis=0)
@@ -121,10 +115,7 @@ class Proposals:
         self._validation, self._search, self._dynamics = validation, search, dynamics
 
     def next(self, trials: Sequence[Trial], rejected: int = 0) -> tuple[Array, Note]:
-        """Return the search's next point ``(d,)``, tested and rounded, and its note.
-
-        The point of an earlier trial stays, and independent draws are only rounded.
-        """
+        """Return the search's next point ``(d,)``, tested and rounded unless an earlier trial has it, and its note."""
         search, steady = self._search, Steadiness(self._dynamics.study.planner)
         with stage("choosing a task", unit="designs") if search.uses_prediction else nullcontext():
             if search.uses_prediction:
@@ -194,10 +185,7 @@ class Proposals:
     def _final(
         self, point: Array, trials: Sequence[Trial], steady: Steadiness | None, note: Note, rejected: int
     ) -> tuple[Array, Note]:
-        """Return a steady task, if that is tested, and rounded; of a suite, the nearest task that is left.
-
-        Its note has the number of tasks that were rejected.
-        """
+        """Return a steady task (if tested), rounded or left of a suite; its note counts the rejected ones."""
         remaining = remaining_tasks(self._validation, trials)
         if steady is not None:
             # On M itself, no distance depends on how a controller would react to errors of M; a suite has no others.
@@ -227,10 +215,7 @@ class IndependentDraws:
         return space.rounded(space.unit_draws(1, self._generator(len(trials), _DRAW))[0])
 
     def test(self, trials: Sequence[Trial]) -> Array:
-        """Return the next point ``(d,)`` of the Latin hypercubes of tests; it depends on no result.
-
-        Of a suite, the task that is left and nearest to it is executed.
-        """
+        """Return the next point ``(d,)`` of the Latin hypercubes of tests, whatever the results are."""
         block, row = divmod(spread_tests(trials), TESTS)
         points = latin_hypercube(TESTS, self._validation.space.dimension, self._generator(block, _HYPERCUBE))
         return np.asarray(points[row])

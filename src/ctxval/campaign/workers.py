@@ -58,11 +58,7 @@ def timed_out(timeout: float, seconds: float) -> Execution:
 
 
 class WorkerPool(ABC):
-    """Workers that execute one plan each.
-
-    Attributes:
-        size: the number of workers.
-    """
+    """``size`` workers that execute one plan each."""
 
     size: int
 
@@ -271,7 +267,7 @@ def _exit_on_signal(_signal: int, _frame: FrameType | None) -> None:
 
 
 def _leave_once() -> bool:
-    """Ignore signals from now on, because the worker ends; return whether it had not yet begun to end.
+    """Ignore signals, because the worker ends; return whether it had not yet begun to end.
 
     An exception while a forked process ends would let it go on where it was forked, as a copy of the campaign.
     """

@@ -32,9 +32,9 @@ def provenance_of_store(store: Store) -> Provenance:
 
 
 def other_stores(path: Path) -> list[Neighbour]:
-    """Return the other stores in a store's folder with trials of the same validation and model, of any search and seed.
+    """Return other stores beside a store with trials of the same validation and model, each with its worst trial.
 
-    Each comes with its worst trial. Nothing is built, run or written. Files that cannot be read are skipped.
+    Nothing is built, run or written. Files that cannot be read are skipped.
     """
     others = []
     with suppress(*_UNREADABLE):

@@ -72,6 +72,11 @@ def _numbers(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and all(map(_number, value))
 
 
+def follows(trial: Trial, earlier: list[Trial]) -> bool:
+    """Return whether a trial has the next number and the same task space as the earlier trials."""
+    return trial.number == len(earlier) and (not earlier or trial.unit_point.shape == earlier[0].unit_point.shape)
+
+
 def read_json(text: Any, *, finite: bool = True) -> Any:
     """Return the value of a JSON text."""
 

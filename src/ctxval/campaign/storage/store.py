@@ -266,8 +266,7 @@ class Store(Database):
         with self._rows(f"SELECT {COLUMNS}, checksum FROM trials ORDER BY number") as cursor:
             for *row, checksum in cursor:
                 trial = read_trial(tuple(row), checksum)
-                fits = trial is not None and (not trials or trial.unit_point.shape == trials[0].unit_point.shape)
-                if trial is None or trial.number != len(trials) or not fits:
+                if trial is None or not rows.follows(trial, trials):
                     raise self._damaged(f"its trial {len(trials)} cannot be read")
                 trials.append(trial)
         return trials
