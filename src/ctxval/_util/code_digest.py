@@ -82,9 +82,6 @@ def enclosed(function: types.FunctionType) -> list[Any]:
     return contents
 
 
-# What source may use
-
-
 def _source_and_uses(item: Any) -> tuple[list[str], list[Any]]:
     """Return the digests of what an object is made of, if that is source of users, and the objects that it uses."""
     match item:
@@ -169,9 +166,6 @@ def _constants(code: types.CodeType) -> str:
         for item in code.co_consts
     ]
     return _hashed((code.co_names, constants))
-
-
-# The syntax tree
 
 
 @dataclass

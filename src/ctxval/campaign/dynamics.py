@@ -33,11 +33,8 @@ from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
 
-PREDICTION = "prediction"
-"""Key of the prediction of an execution in the note of its trial."""
-
-NEAR = 0.02
-"""A task that differs from an executed one by less than this in every coordinate is no new one."""
+PREDICTION = "prediction"  #: key of the prediction of an execution in the note of its trial
+NEAR = 0.02  #: a task that differs from an executed one by less than this in every coordinate is no new one
 
 _Known = Latest[tuple[object, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None]]
 

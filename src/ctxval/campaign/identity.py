@@ -188,9 +188,6 @@ def _equal(before: Any, after: Any) -> bool:
     return bool(np.isclose(after, before, rtol=1e-6, atol=1e-12))
 
 
-# Another distance
-
-
 def remeasure(store: Store, validation: Validation, description: dict[str, Any]) -> list[Trial]:
     """Recompute the distance of every stored execution; return the trials whose distance changed."""
     with store.sole_writer():

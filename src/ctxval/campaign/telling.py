@@ -26,11 +26,8 @@ from ctxval.systems.subprocess import run_supervised
 
 _PROGRAM = Path(__file__).absolute().with_name("recording_process.py")
 
-REFUSED = 3
-"""Exit status of the confined process if the file cannot be used; its output is the reason."""
-
-Names = Mapping[str, str]
-"""The names of states or inputs with their units."""
+REFUSED = 3  #: exit status of the confined process if the file cannot be used; its output is the reason
+Names = Mapping[str, str]  #: the names of states or inputs with their units
 
 
 @dataclass(frozen=True)

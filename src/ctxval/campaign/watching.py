@@ -18,9 +18,7 @@ from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.run_statistics import DISTANCE, RunStatistics, names
 
-FALSE_ALARMS = 1e-3
-"""Usual rate of false alarms: one in 1,000 executions."""
-
+FALSE_ALARMS = 1e-3  #: usual rate of false alarms: one in 1,000 executions
 _MOST = 24  # certified executions that are predicted from the others, the latest ones: each is learned from anew
 
 

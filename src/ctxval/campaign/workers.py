@@ -32,10 +32,7 @@ from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import CampaignError, InputError
 
 _GRACE_PERIOD = 2.0  # seconds that a worker has to clean up before it is killed
-
-AHEAD = 0.5
-"""Seconds of work that is begun before its turn, if its choice depends on no result; Ctrl-C waits for it."""
-
+AHEAD = 0.5  #: seconds of work that is begun before its turn, if its choice depends on no result; Ctrl-C waits for it
 _BATCH = 128  # largest number of tasks that are executed in one call
 _TERMINATED = 143  # exit status of a worker that ended after SIGTERM, as in shells
 

@@ -19,8 +19,7 @@ from ctxval.core.space import Parameters, Point, TaskSpace
 from ctxval.core.task_distribution import Continuous, Sampler
 from ctxval.errors import InputError, UnknownNameError
 
-SUITE = "_tasks"
-"""Key of the tasks in the description of a suite; no parameter can have this name."""
+SUITE = "_tasks"  #: key of the tasks in the description of a suite; no parameter can have this name
 
 TASK = "task"
 """The name of a task, by which trials, tables and command lines call it; and the category of tasks with names alone."""

@@ -26,8 +26,7 @@ CONVERGED = "converged"
 UNSTEADY = "unsteady"
 """Key in the note of a trial: the number of tasks that were not executed because their controllers jump."""
 
-AT_LEAST = "at_least"
-"""Key in the note of a failed trial: the distance that the steps before the failure have already."""
+AT_LEAST = "at_least"  #: key in the note of a failed trial: the distance that the steps before the failure have already
 
 TOLD_ALONE = "its distance was told without a trajectory, and the distance has changed since: execute the task again."
 """The failure of a trial that was reported without a trajectory, so that a new distance cannot be computed."""

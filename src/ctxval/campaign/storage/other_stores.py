@@ -18,8 +18,7 @@ from ctxval.campaign.storage.store import Store
 from ctxval.certificates import Neighbour, Provenance
 from ctxval.core.trial import Trial
 
-STORE_SUFFIXES = (".sqlite", ".sqlite3", ".db")
-"""Suffixes of files that are taken for stores."""
+STORE_SUFFIXES = (".sqlite", ".sqlite3", ".db")  #: suffixes of files that are taken for stores
 _UNREADABLE = (sqlite3.Error, OSError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
 
 

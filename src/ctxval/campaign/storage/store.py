@@ -24,8 +24,7 @@ from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAcces
 
 _DRAWS, _THRESHOLDS = "draws", "thresholds"  # keys in the table experiment that do not describe the experiment
 
-CAUSE = "cause"
-"""Key of what is computed of the cause of a model's error: a text, for reports."""
+CAUSE = "cause"  #: key of what is computed of the cause of a model's error: a text, for reports
 
 
 @checked
