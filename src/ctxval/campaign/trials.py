@@ -288,7 +288,7 @@ class TrialRecorder:
             self.executing.discard(trial.number)
             self._trials[trial.number] = trial
             if trial.distance is not None:
-                self._tell_search([trial])
+                self.search.tell(np.array([trial.unit_point]), [trial.distance])
         return ended
 
     def add(self, executions: Sequence[tuple[Plan, Execution]], wait: float = 0.0) -> list[Trial | None]:
