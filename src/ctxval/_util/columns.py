@@ -164,9 +164,8 @@ def unit_advice(period: float, dt: float) -> str:
     """Return the sentence that times probably have another unit; empty if their period does not suggest one."""
     for factor, unit in ((1e3, "ms"), (1e6, "us"), (1e9, "ns")):
         if 1 / FAR < period / dt / factor < FAR:
-            return (
-                f"if the times are in {unit}, name their column t [{unit}], or give time_unit = {unit!r} in a mapping"
-            )
+            mapped = f"or give time_unit = {unit!r} in a mapping"
+            return f"if the times are in {unit}, name their column t [{unit}], {mapped}"
         if 1 / FAR < period * factor / dt < FAR:
             return f"the times seem to be in s although they are stated in {unit}"
     return ""

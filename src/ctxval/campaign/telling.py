@@ -120,9 +120,8 @@ def _require_finite(path: Path, recording: Trajectory, states: Names, inputs: Na
     """Refuse a complete recording with a number that is missing, infinite or a mark; the message says where."""
     if recording.ended != COMPLETE:
         return  # the reason why it ended is reported instead
-    advice = (
-        "If the execution has no usable recording, report it as failed: with --failed, or in that column of a table."
-    )
+    failed = "report it as failed: with --failed, or in that column of a table"
+    advice = f"If the execution has no usable recording, {failed}."
     for names, values in ((list(states), recording.states), (list(inputs), recording.inputs)):
         wrong = np.argwhere(~np.isfinite(values[:, : len(names)]))
         if len(wrong):

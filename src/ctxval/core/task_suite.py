@@ -193,8 +193,6 @@ def _by_name(tasks: Any) -> dict[str, dict[str, Any]]:
         raise InputError("a parameter of a suite must not be called 'task': that is the name of each task.")
     for name, values in others:
         if set(values) != set(first[1]):
-            have, wanted = enumerated(values, 6) or "none", enumerated(first[1], 6)
-            raise InputError(
-                f"all tasks of a suite must have the same parameters: {first[0]!r} has {wanted}, {name!r} has {have}."
-            )
+            have = f"{first[0]!r} has {enumerated(first[1], 6)}, {name!r} has {enumerated(values, 6) or 'none'}"
+            raise InputError(f"all tasks of a suite must have the same parameters: {have}.")
     return by_name
