@@ -78,11 +78,7 @@ def _description(module: str, name: str) -> str:
         return f".. py:data:: {name}\n\n{text}"
     elsewhere = documented().get(_defined(value), f"{module}.{name}") != f"{module}.{name}"
     once = "\n   :no-index:" if elsewhere else ""
-    if not inspect.isclass(value):
-        return f".. autofunction:: {name}{once}"
-    # The results of a campaign are methods of its base class, which has no description of its own.
-    inherited = "\n   :inherited-members:" if value is ctxval.Campaign else ""
-    return f".. autoclass:: {name}\n   :members:{inherited}{once}"
+    return f".. autoclass:: {name}\n   :members:{once}" if inspect.isclass(value) else f".. autofunction:: {name}{once}"
 
 
 def _text_of_constant(module: str, name: str) -> list[str]:

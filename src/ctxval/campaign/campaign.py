@@ -4,43 +4,54 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import replace as replaced
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctxval._util.arrays import Array
 from ctxval._util.checked import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Seconds, checked
 from ctxval._util.describe import describe
-from ctxval._util.progress import progress_shown
+from ctxval._util.progress import progress_shown, stage
+from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
+from ctxval.campaign.dynamics import LearnedFromTrials
 from ctxval.campaign.envelope import EnvelopeSearch
 from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.executors import Executor, worker_pool
+from ctxval.campaign.history import executed_trials
 from ctxval.campaign.identity import identify, search_of
-from ctxval.campaign.interval_search import IntervalSearch
+from ctxval.campaign.interval_search import IntervalSearch, with_next_task
 from ctxval.campaign.plot import overview
-from ctxval.campaign.results import CampaignResults
+from ctxval.campaign.storage.other_stores import provenance_of_store
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.watching import FALSE_ALARMS, Watch
-from ctxval.certificates import RESOLUTION, CertificateOptions
+from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Provenance, Verdict, assess, judge
+from ctxval.certificates.envelope import Envelope
 from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.certificates.sample import without_success
+from ctxval.core.distance import Distance
+from ctxval.core.plan import StartOffset, input_difference, start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
-from ctxval.errors import CertificateError, InputError
+from ctxval.errors import CertificateError, CtxvalError, InputError
+from ctxval.gp.surrogate import Surrogate, fit_surrogate
 from ctxval.searches import Auto, Search
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from pandas import DataFrame
 
 __all__ = ["Campaign", "OpenTrial"]
 
 
 @checked
-class Campaign(CampaignResults):
+class Campaign:
     """A search for the worst task, with every trial stored before and after its execution.
 
     The budget is a total: running again resumes the campaign. A resumed campaign makes the same choices as an
@@ -79,12 +90,84 @@ class Campaign(CampaignResults):
         self.name = name
         trials = store if isinstance(store, Store) else Store(store)
         self.search: Search = search_of(trials) if search is None else search
-        parts = {"name": name, "seed": self.seed, "search": describe(self.search), "validation": validation.describe()}
-        description: dict[str, Any] = json.loads(json.dumps(parts))
+        described = {
+            "name": name,
+            "seed": self.seed,
+            "search": describe(self.search),
+            "validation": validation.describe(),
+        }
+        description: dict[str, Any] = json.loads(json.dumps(described))
         identify(trials, validation, description, accept_change, remeasure)
         self.recorder = TrialRecorder(validation, self.search, trials, self.seed, description)
         if remeasure:
             self.remeasure()
+
+    # The trials
+
+    @property
+    def validation(self) -> Validation:
+        """The map p -> d(p), with the present distance function."""
+        return self.recorder.validation
+
+    @property
+    def store(self) -> Store:
+        """The store of the trials."""
+        return self.recorder.store
+
+    @property
+    def trials(self) -> tuple[Trial, ...]:
+        """All trials in the order of asking."""
+        return self.recorder.trials
+
+    @property
+    def completed(self) -> list[Trial]:
+        """The trials with a distance."""
+        return [trial for trial in self.trials if trial.state == "completed"]
+
+    @property
+    def failed(self) -> list[Trial]:
+        """The trials that failed."""
+        return [trial for trial in self.trials if trial.state == "failed"]
+
+    @property
+    def unmeasured(self) -> list[Trial]:
+        """The trials that were executed but have no distance, because it could not be measured."""
+        return [trial for trial in self.trials if trial.state == "unmeasured"]
+
+    @property
+    def executions(self) -> int:
+        """The number of executions of S that have ended, with or without success."""
+        return self.recorder.executions
+
+    @property
+    def worst(self) -> Trial | None:
+        """The completed trial with the largest distance."""
+        return max(self.completed, key=lambda trial: trial.distance or 0.0, default=None)
+
+    def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
+        """Return the trajectories of the model and of the system in a trial; None if a trajectory is not stored.
+
+        That of a failed execution has the steps before the failure.
+        """
+        return self.store.trajectory(trial.number, "model"), self.store.trajectory(trial.number, "system")
+
+    def start_offset(self, trial: Trial) -> StartOffset | None:
+        """Return how far an execution started from the initial state of its task; None if it was not recorded."""
+        executed = self.store.trajectories([trial.number], "system").get(trial.number)
+        point = self.validation.space.point(trial.parameters)
+        return None if executed is None else start_offset(self.validation, point, executed)
+
+    def input_difference(self, trial: Trial) -> str | None:
+        """Return where the recorded inputs of a trial are not those of its controller at the recorded states.
+
+        It is a hint that the recording is of another run, or begins at another moment than the controller. Returns None
+        if they agree up to a third, or if nothing was recorded.
+        """
+        executed = self.store.trajectories([trial.number], "system").get(trial.number)
+        if executed is not None:
+            with suppress(CtxvalError):  # the result is stored, whether or not its controller can be designed again
+                return input_difference(self.validation, self.recorder.plan(trial), executed)
+        return None
 
     # Running
 
@@ -305,6 +388,15 @@ class Campaign(CampaignResults):
                 choice = search.choose() if self.executions + waiting < budget else None
                 return None if choice is None else self.recorder.open(choice)
 
+    def reopen(self, number: int, *, ended: bool = False) -> OpenTrial:
+        """Return an open trial again, with its task and controller.
+
+        With ``ended``, return a trial whose result was told, to replace the result.
+        """
+        self.refresh()
+        trial = self.recorder.trial(number, ended=ended)
+        return OpenTrial(trial, self.recorder.plan(trial))
+
     @checked
     def tell(
         self,
@@ -366,6 +458,112 @@ class Campaign(CampaignResults):
         plan = self.validation.plan(self.validation.space.point(parameters))
         return self.recorder.add([(plan, execution.measured(self.validation, plan, start_tolerance))], wait)[0]
 
+    def refresh(self) -> None:
+        """Read the trials again if another process has changed the store; refuse it if its experiment has changed."""
+        self.recorder.refresh()
+
+    def remeasure(self, distance: Distance | None = None) -> list[Trial]:
+        """Recompute the distances of all stored executions, without an execution; return the trials that changed.
+
+        The history of the store keeps the earlier values. A distance without a trajectory cannot be recomputed: if the
+        distance function has changed, the trial becomes unmeasured.
+
+        Args:
+            distance: the new distance; by default, that of the validation.
+
+        Raises:
+            DistanceError: if the distance of a measured trial cannot be computed any more; nothing is changed.
+        """
+        return self.recorder.remeasure(distance)
+
+    # Results
+
+    @property
+    def estimate(self) -> float | None:
+        """The search's estimate of d*: the largest distance, unless the search discards some (SD) or repeats its tasks.
+
+        If the search repeats its tasks, the estimate is the largest mean distance of a task with all its repetitions.
+        It is None if there are too few distances.
+        """
+        return self.recorder.search.estimate(*self._distances())
+
+    @property
+    def provenance(self) -> Provenance:
+        """What a certificate needs besides the trials: the task space, the search, changes, and what M predicts."""
+        recorder, validation, trials = self.recorder, self.recorder.validation, self.recorder.trials
+        offsets = [
+            (start_offset(validation, validation.space.point(trial.parameters), executed), trial.number)
+            for trial, executed in executed_trials(recorder.store, trials)
+        ]
+        return replaced(
+            provenance_of_store(recorder.store),
+            space=validation.space,
+            learned=LearnedFromTrials(validation, trials, recorder.dynamics),
+            start=max(((offset.size, f"{offset.text} (trial {number})") for offset, number in offsets), default=None),
+            units=validation.labels.units,
+        )
+
+    @checked
+    def state_threshold(self, threshold: PositiveFloat) -> None:
+        """Record in the store that a threshold was stated, and how many distances were known.
+
+        A verdict says so if the threshold was first stated after distances were known. :meth:`run`,
+        :meth:`ask_for_verdict` and :meth:`verdict` state their thresholds; call this if the trials come from
+        :meth:`ask`, :meth:`audit` or :meth:`add`. A threshold that was stated before is not recorded again.
+        """
+        self.store.state_threshold(float(threshold))
+
+    @checked
+    def verdict(
+        self,
+        threshold: PositiveFloat,
+        confidence: float = CONFIDENCE,
+        *,
+        resolution: float = RESOLUTION,
+        certificate: CertificateOptions | None = None,
+        progress: bool | None = None,
+    ) -> Verdict:
+        """Return whether the model can be trusted up to a threshold tau.
+
+        The model is falsified if an executed distance exceeds the threshold, and validated if a certificate bounds d*
+        by the threshold. Otherwise the verdict is undecided, with a forecast of the executions that would decide
+        and, if learned dynamics choose it, the next task.
+
+        Args:
+            threshold: tau, in the units of the distance.
+            confidence: the confidence level of the certificate, at least 0.5.
+            resolution: the largest distance between a task and its nearest trial that a validation permits, in
+                diagonals of the task space.
+            certificate: the kind and the options of the certificate, in place of ``auto`` with the two options above.
+            progress: as in :meth:`run`.
+
+        Raises:
+            CertificateError: if an option of the certificate is not valid.
+        """
+        options, recorder = CertificateOptions.or_automatic(certificate, confidence, resolution), self.recorder
+        self.state_threshold(threshold)
+        with progress_shown(progress), stage("certifying"):
+            return with_next_task(judge(recorder.trials, threshold, options, self.provenance), recorder, options)
+
+    @checked
+    def certify(
+        self,
+        confidence: float = CONFIDENCE,
+        *,
+        resolution: float = RESOLUTION,
+        certificate: CertificateOptions | None = None,
+        progress: bool | None = None,
+    ) -> Certificate:
+        """Return the bound on d*, which needs no threshold. The arguments are those of :meth:`verdict`.
+
+        A CertificateError is raised if the theory of the certificate refuses the trials.
+        """
+        options = CertificateOptions.or_automatic(certificate, confidence, resolution)
+        with progress_shown(progress), stage("certifying"):
+            certified = assess(self.trials, options, provenance=self.provenance).certificate
+        assert certified is not None  # without a threshold, a refusal is raised
+        return certified
+
     @checked
     def watch(
         self,
@@ -391,9 +589,63 @@ class Campaign(CampaignResults):
         with progress_shown(progress):
             return Watch(self, threshold, false_alarms, state)
 
+    @checked
+    def envelope(
+        self,
+        threshold: PositiveFloat,
+        confidence: float = CONFIDENCE,
+        *,
+        certificate: CertificateOptions | None = None,
+        progress: bool | None = None,
+    ) -> Envelope:
+        """Return the set of tasks on which d stays below a threshold, with a confidence for all of them at once.
+
+        It follows from the learned dynamics, and says why it is not stated if these do not suffice: it needs the tests
+        that a validation needs. ``run(..., envelope=True)`` executes what is missing.
+
+        Args:
+            threshold: tau, in the units of the distance.
+            confidence: the confidence that d stays below the threshold on all tasks of the set.
+            certificate: the options ``auto`` or ``dynamics``, in place of the confidence.
+            progress: as in :meth:`run`.
+
+        Raises:
+            CertificateError: if the confidence needs too many posterior samples.
+        """
+        options = CertificateOptions.or_automatic(certificate, confidence, RESOLUTION)
+        search = EnvelopeSearch(IntervalSearch(self.recorder, options, self.executions + 1, threshold, keeps=False))
+        with progress_shown(progress):
+            return search.envelope()
+
+    def surrogate(self) -> Surrogate:
+        """Return the Gaussian process of the distance over the task space, for every search, from two distances on."""
+        of_search = self.recorder.search.surrogate()
+        return fit_surrogate(*self._distances()) if of_search is None else of_search
+
+    def to_dataframe(self) -> DataFrame:
+        """Return the trials as a table of pandas, one row for each.
+
+        The columns are number, origin, state, one for each task parameter (``name[0], name[1], ...`` for a vector),
+        distance, seconds, attempts and failure. If a parameter has the name of another column, such as ``distance``,
+        its column is ``parameters.distance``. Unknown values are missing values.
+        """
+        return display.to_dataframe(self.trials, self.validation.space)
+
     def plot(self, *, threshold: float | None = None, bound: float | None = None, ax: Axes | None = None) -> Axes:
         """Draw the surrogate over one task parameter, or else the distances in their order; return the axes.
 
         By default, the axes are new ones of ``matplotlib.pyplot``. The threshold and a bound on d* are drawn as lines.
         """
         return overview(self, threshold=threshold, bound=bound, ax=ax)
+
+    def _distances(self) -> tuple[Array, Array]:
+        """Return the points of the unit cube with a distance ``(n, d)``, and the distances ``(n,)``."""
+        completed = self.completed
+        points = np.array([trial.unit_point for trial in completed]).reshape(-1, self.validation.space.dimension)
+        return points, np.array([trial.distance for trial in completed], dtype=np.float64)
+
+    def __repr__(self) -> str:
+        return display.as_text(self)
+
+    def _repr_html_(self) -> str:
+        return display.as_html(self)

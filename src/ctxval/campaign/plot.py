@@ -17,7 +17,6 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.files import MADE_BY, written_whole
 from ctxval._util.representation import task_text
-from ctxval.campaign.results import CampaignResults
 from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
@@ -27,6 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from ctxval.campaign.campaign import Campaign
+
 # Okabe and Ito's colours survive colour blindness; the line styles and the markers survive grey print.
 _BLUE, _ORANGE, _BLACK, _GREY = "#0072B2", "#D55E00", "#000000", "#B0B0B0"
 
@@ -34,9 +35,7 @@ Limit = float | None
 """A threshold tau, or a bound on d*, which is drawn as a line; None if there is none."""
 
 
-def overview(
-    campaign: CampaignResults, *, threshold: Limit = None, bound: Limit = None, ax: Axes | None = None
-) -> Axes:
+def overview(campaign: Campaign, *, threshold: Limit = None, bound: Limit = None, ax: Axes | None = None) -> Axes:
     """Draw the most informative single plot of a campaign.
 
     It is the surrogate if there is one task parameter and two distances are known, and :func:`convergence` otherwise.
@@ -47,9 +46,7 @@ def overview(
     return convergence(campaign, threshold=threshold, bound=bound, ax=ax)
 
 
-def convergence(
-    campaign: CampaignResults, *, threshold: Limit = None, bound: Limit = None, ax: Axes | None = None
-) -> Axes:
+def convergence(campaign: Campaign, *, threshold: Limit = None, bound: Limit = None, ax: Axes | None = None) -> Axes:
     """Draw the distance of each trial and the largest distance so far, and mark the trials without a distance."""
     from matplotlib.ticker import MaxNLocator
 
@@ -71,7 +68,7 @@ def convergence(
 
 
 def surrogate_slice(
-    campaign: CampaignResults, axis: int = 0, *, threshold: Limit = None, bound: Limit = None, ax: Axes | None = None
+    campaign: Campaign, axis: int = 0, *, threshold: Limit = None, bound: Limit = None, ax: Axes | None = None
 ) -> Axes:
     """Draw the Gaussian process along one task parameter, through the worst executed task, with its 95 % band.
 
@@ -100,7 +97,7 @@ def surrogate_slice(
     return _finished(axes, campaign, threshold, bound)
 
 
-def _finished(axes: Axes, campaign: CampaignResults, threshold: Limit, bound: Limit) -> Axes:
+def _finished(axes: Axes, campaign: Campaign, threshold: Limit, bound: Limit) -> Axes:
     """Label the axis of the distance, and draw the threshold and the bound as lines, which also differ in style."""
     units = campaign.validation.labels.units
     axes.set_ylabel(f"distance [{units}]" if units else "distance")
@@ -112,7 +109,7 @@ def _finished(axes: Axes, campaign: CampaignResults, threshold: Limit, bound: Li
     return axes
 
 
-def _draw_samples(axes: Axes, campaign: CampaignResults, place: Callable[[Trial], float]) -> None:
+def _draw_samples(axes: Axes, campaign: Campaign, place: Callable[[Trial], float]) -> None:
     """Draw the known distances of the trials, with a different marker for each origin."""
     styles = (
         ("initial samples", ("iid", "spread", "initial", "manual"), "white"),
@@ -126,7 +123,7 @@ def _draw_samples(axes: Axes, campaign: CampaignResults, place: Callable[[Trial]
             axes.plot(x, y, "o", markersize=5, markerfacecolor=face, markeredgecolor=_BLACK, label=label)
 
 
-def worst_trajectories(campaign: CampaignResults) -> Figure:
+def worst_trajectories(campaign: Campaign) -> Figure:
     """Draw the trajectories of M and of S for the worst executed task."""
     worst = _worst(campaign)
     model, system = campaign.trajectories(worst)
@@ -195,7 +192,7 @@ def _axes(ax: Axes | None) -> Axes:
     return pyplot.subplots(layout="constrained")[1]
 
 
-def _worst(campaign: CampaignResults) -> Trial:
+def _worst(campaign: Campaign) -> Trial:
     if campaign.worst is None:
         raise InputError("there is nothing to draw: no distance is known yet.")
     return campaign.worst

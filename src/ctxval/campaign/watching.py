@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,12 +11,14 @@ from ctxval._util.checked import require
 from ctxval._util.progress import advance, stage
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.history import executed_trials
-from ctxval.campaign.results import CampaignResults
 from ctxval.certificates.expiry import EXCEEDED, FEWEST, Statistic, WatchedChannel, WatchState
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.run_statistics import DISTANCE, RunStatistics, names
+
+if TYPE_CHECKING:
+    from ctxval.campaign.campaign import Campaign
 
 FALSE_ALARMS = 1e-3  #: usual rate of false alarms: one in 1,000 executions
 _MOST = 24  # certified executions that are predicted from the others, the latest ones: each is learned from anew
@@ -37,7 +39,7 @@ class Watch:
     """
 
     def __init__(
-        self, campaign: CampaignResults, threshold: float, false_alarms: float, state: WatchState | None = None
+        self, campaign: Campaign, threshold: float, false_alarms: float, state: WatchState | None = None
     ) -> None:
         self.campaign, dynamics = campaign, campaign.recorder.dynamics
         executed = executed_trials(campaign.store, campaign.trials)
