@@ -165,7 +165,7 @@ def test_the_budget_is_a_total_and_interrupted_trials_come_first(tmp_path: Path)
     marks.mkdir()
     campaign = logged(store, str(marks), 0)
     for _ in range(2):
-        campaign.recorder.start(Choice())
+        campaign.recorder.open_all([Choice()], attempts=1)
     again = logged(store, str(marks), 0).run(5, workers=3)
     assert (again.executions, len(again.trials)) == (5, 5)
     assert [trial.attempts for trial in again.trials] == [2, 2, 1, 1, 1]

@@ -14,10 +14,8 @@ Sloped = Callable[[Array], tuple[Array, Array]]  #: points ``(..., d)`` -> value
 
 
 def latin_hypercube(count: int, dimension: int, rng: np.random.Generator) -> Array:
-    """Return points ``(n, d)`` of the unit cube in random order: each n-th of each coordinate's range has one.
-
-    scipy.stats has such a function, too, and takes a second to load.
-    """
+    """Return points ``(n, d)`` of the unit cube in random order: each n-th of each coordinate's range has one."""
+    # scipy.stats has such a function, too, and takes a second to load.
     parts = rng.permuted(np.tile(np.arange(count), (dimension, 1)), axis=1).T
     return np.asarray((parts + rng.random((count, dimension))) / count)
 

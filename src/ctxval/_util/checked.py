@@ -51,10 +51,7 @@ _PLAIN: dict[Any, tuple[str, tuple[type, ...]]] = {
 
 
 def checked(made: Checkable) -> Checkable:
-    """Check the arguments of a function, or of a class's own constructor, whenever it is called.
-
-    A value that is the default is not checked.
-    """
+    """Check the arguments of a function or of a class's own constructor at each call, unless they are the default."""
     function: Any = vars(made).get("__init__") if isinstance(made, type) else made
     if function is None:
         return made  # the constructor is that of a base class

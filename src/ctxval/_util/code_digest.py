@@ -82,9 +82,6 @@ def enclosed(function: types.FunctionType) -> list[Any]:
     return contents
 
 
-# What source may use
-
-
 def _source_and_uses(item: Any) -> tuple[list[str], list[Any]]:
     """Return the digests of what an object is made of, if that is source of users, and the objects that it uses."""
     match item:
@@ -169,9 +166,6 @@ def _constants(code: types.CodeType) -> str:
         for item in code.co_consts
     ]
     return _hashed((code.co_names, constants))
-
-
-# The syntax tree
 
 
 @dataclass
@@ -260,7 +254,7 @@ def _hashed(tree: Any) -> str:
 
 
 def _plain(node: Any, *, top: bool = False, bare: bool = False) -> Any:
-    """Return a tree as tuples, without docstrings, and if it is bare without imports and any text that stands alone.
+    """Return a tree as tuples without docstrings, bare also without imports and texts that stand alone.
 
     Empty fields are left out, so that every version of Python gives the same tuples.
     """

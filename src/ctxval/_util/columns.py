@@ -61,10 +61,7 @@ def conversion(recorded: str, wanted: str) -> float:
 
 
 def named_unit(column: str) -> tuple[str, str, bool]:
-    """Return the name and the unit that a column states, and whether the unit may be part of the name instead.
-
-    ``x_m`` may be a measured x, so such endings are weak.
-    """
+    """Return the name and the unit of a column, and whether the unit is weak: ``x_m`` may be a measured x."""
     if len(column) > 200:
         return column, "", False
     if (bracketed := _BRACKETS.fullmatch(column)) is not None:
@@ -167,16 +164,15 @@ def unit_advice(period: float, dt: float) -> str:
     """Return the sentence that times probably have another unit; empty if their period does not suggest one."""
     for factor, unit in ((1e3, "ms"), (1e6, "us"), (1e9, "ns")):
         if 1 / FAR < period / dt / factor < FAR:
-            return (
-                f"if the times are in {unit}, name their column t [{unit}], or give time_unit = {unit!r} in a mapping"
-            )
+            mapped = f"or give time_unit = {unit!r} in a mapping"
+            return f"if the times are in {unit}, name their column t [{unit}], {mapped}"
         if 1 / FAR < period * factor / dt < FAR:
             return f"the times seem to be in s although they are stated in {unit}"
     return ""
 
 
 def sentinels(values: Array, factor: float = 1.0) -> list[float]:
-    """Return the values that stand for a missing one, such as -999, -9999 or 1e9, and are far outside all others.
+    """Return the values far outside all others that stand for a missing one, such as -999, -9999 or 1e9.
 
     The factor is that to the unit before a conversion of the table, which converted marks such as -999 too.
     """
@@ -220,10 +216,7 @@ class CsvTable:
         require_distinct(str(path), self.names)
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield the rows below the header that are not blank, each with the number of its last line.
-
-        Only the last row may be shorter than the header, because a trajectory has no inputs at its last time.
-        """
+        """Yield the rows below the header that are not blank, with their line numbers; the last may be shorter."""
         width, short = len(self.names), ""
         for line, row in itertools.islice(self._cells(), 1, None):
             if len(row) != width and not short:

@@ -33,10 +33,7 @@ _inherited: Callable[[Any], Any]
 
 
 def on_all_cores(function: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
-    """Return the result of a function for each part, in the order of the parts; in parallel if processes can be forked.
-
-    The child processes inherit the function, so it need not be picklable; the parts and the results must be.
-    """
+    """Return a function's results for parts in order; forked processes, if there are any, inherit the function."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     workers = min(cores, len(parts))
     if workers < 2 or not can_fork():
@@ -122,10 +119,7 @@ class Interrupts:
 
 
 def raised_by_signal(error: BaseException) -> bool:
-    """Return whether the handler of a signal that ends processes raised an exception, rather than the code itself.
-
-    A handler that raises an ordinary exception, for instance that of an alarm, belongs to the code.
-    """
+    """Return whether the handler of a signal that ends processes raised an exception, and not the code itself."""
     if isinstance(error, Exception):
         return False
     names = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK", "SIGUSR1", "SIGUSR2")  # the last two preempt jobs of clusters

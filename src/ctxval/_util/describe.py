@@ -83,10 +83,7 @@ def without_numbers(description: Any) -> Any:
 
 
 def first_difference(stored: Any, present: Any) -> str | None:
-    """Return a sentence about the first difference of two descriptions; None if they agree.
-
-    The name of a function does not matter if the digest of its source is known.
-    """
+    """Return the first of the differences of two descriptions as a sentence; None if they agree."""
     return next((sentence for _, sentence in differences(stored, present)), None)
 
 

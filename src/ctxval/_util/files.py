@@ -115,10 +115,7 @@ def make_folder_of(path: str | Path) -> None:
 
 @contextmanager
 def written_whole(path: str | Path, *, text: bool = False) -> Iterator[IO[Any]]:
-    """Yield a file to write to, which gets its name at the end: it is complete or, after an error or a kill, missing.
-
-    Two processes may write the same file at once: one of the two complete files stays.
-    """
+    """Yield a file that gets its name at the end: it is complete or missing, also if two processes write it."""
     target, header = Path(os.path.realpath(path)), b""  # a link stays a link
     with suppress(InputError, OSError), open_regular(target, sys.maxsize) as present:
         header = present.read(16)

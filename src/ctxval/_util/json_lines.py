@@ -19,8 +19,8 @@ Key = tuple[Any, ...]
 class JsonLines(Mapping[Key, Record]):
     """The records of a file of JSON lines; of several records with one key, the last one counts.
 
-    One process appends. If it is killed in the middle of a line, the incomplete last line is ignored, and it is removed
-    before the next record is appended. The file is read once, when it is first asked, and made by the first record.
+    One process appends. If it is killed in a line, that line is ignored, and removed before the next record. The file
+    is read once, when it is first asked, and made by the first record.
     """
 
     def __init__(self, path: Path, key: Sequence[str]) -> None:

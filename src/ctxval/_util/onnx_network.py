@@ -100,9 +100,8 @@ class OnnxNetwork(ShortRepr):
 
     def _run(self, rows: list[Array]) -> list[Array]:
         feeds = {port.name: port.fed(row) for port, row in zip(self._inputs, rows, strict=True)}
-        with reworded(
-            "the network cannot be evaluated", Exception, to=ModelError
-        ):  # onnxruntime's exceptions have no base class of their own
+        # The exceptions of onnxruntime have no base class of their own.
+        with reworded("the network cannot be evaluated", Exception, to=ModelError):
             outputs = self._session.run([port.name for port in self._outputs], feeds)
         return [port.read(output) for port, output in zip(self._outputs, outputs, strict=True)]
 
@@ -143,9 +142,8 @@ def _port(node: Any, layered: bool = False) -> _Port:
     layers = sizes[0] if layered and len(sizes) == 3 else None
     if node.type not in _TYPES or (len(sizes) not in (1, 2) and layers is None):
         wanted = "(N, k), (k,) or (L, N, k) with a fixed L" if layered else "(N, k) or (k,)"
-        raise InputError(
-            f"the network's {node.name!r} must be real numbers {wanted}, got {node.type} of shape {node.shape}."
-        )
+        got = f"{node.type} of shape {node.shape}"
+        raise InputError(f"the network's {node.name!r} must be real numbers {wanted}, got {got}.")
     *count, width = sizes if layers is None else sizes[1:]
     if layers is not None and width is not None:
         width *= layers

@@ -22,19 +22,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a stage is: what is being done, how much of it, of how much if that is known, in which unit.
-
-    The note is a sentence about what has just been done, the depth the number of stages that this one is a part of, and
-    ``ended`` is true in the last report of a stage.
-    """
+    """How far a stage is: what is being done, how much of it, of how much if that is known, in which unit."""
 
     stage: str
     done: float
     expected: float | None
     unit: str
-    note: str = ""
-    depth: int = 0
-    ended: bool = False
+    note: str = ""  # a sentence about what has just been done
+    depth: int = 0  # the number of stages that this one is a part of
+    ended: bool = False  # true in the last report of a stage
 
 
 Listener = Callable[[Progress], None]  #: called with each report; it should return soon
@@ -174,9 +170,8 @@ class OnScreen:
                 yield self.make_tasks_table([task for task in self.tasks if (task.elapsed or 0.0) > _DELAY])
 
         name, amount = (TextColumn(f"{{task.{part}}}", markup=False) for part in ("description", "fields[text]"))
-        self._bars = Delayed(
-            name, BarColumn(bar_width=20), amount, TimeElapsedColumn(), console=console, transient=True
-        )
+        columns = name, BarColumn(bar_width=20), amount, TimeElapsedColumn()
+        self._bars = Delayed(*columns, console=console, transient=True)
         self._rows: dict[int, Any] = {}
 
     def __call__(self, progress: Progress) -> None:

@@ -95,10 +95,7 @@ class Registry(Mapping[str, Any], Generic[Made]):
         return ()
 
     def is_data(self, name: Any) -> bool:
-        """Return whether a part with plain arguments runs no code; what is not built in always counts as code.
-
-        No package is looked at, and nothing is imported.
-        """
+        """Return whether a built-in part with plain arguments runs no code; nothing is imported for that."""
         if not isinstance(name, str) or name not in self.built_in:
             return False
         declared = declaration_of(self._exported.get(name))

@@ -34,9 +34,6 @@ class Shown(str):
     __slots__ = ()
 
 
-# Texts
-
-
 def line(text: object, longest: int = LINE) -> str:
     """Return a text of anybody's as one line: control characters written out, the middle of a long one left out."""
     return shortened(" ".join(visible(plain(text)).split()), longest)
@@ -93,9 +90,6 @@ def options(owner: object) -> dict[str, Any]:
     """Return the arguments of the constructor that an object keeps under their own names."""
     kept = getattr(owner, "__dict__", {})
     return {name: kept[name] for name in inspect.signature(type(owner).__init__).parameters if name in kept}
-
-
-# Values
 
 
 def shown(value: Any, depth: int = 3) -> str:
@@ -207,14 +201,8 @@ def _rest(count: int) -> list[str]:
     return [f"... {count - _ITEMS} more"] if count > _ITEMS else []
 
 
-# HTML
-
-
 def table(title: str, rows: Iterable[tuple[str, object]]) -> str:
-    """Return a plain HTML table of two columns; rows whose value is None are left out.
-
-    It sets no colours, so that it is legible on light and dark pages. Every text is escaped.
-    """
+    """Return an HTML table of two columns without colours of its own, without rows of None, and with escaped texts."""
     style = "text-align:left;color:inherit;background:transparent"
     cell = f"{style};vertical-align:top;padding:0.2em 0.8em 0.2em 0.2em;border-bottom:1px solid currentColor"
 

@@ -76,10 +76,7 @@ def reason_of(error: BaseException) -> str:
 
 
 def guarded(text: str) -> str:
-    """Return a text for a cell of CSV, with an apostrophe before it if a spreadsheet would evaluate it.
-
-    :func:`unguarded` removes exactly that apostrophe.
-    """
+    """Return a text for a cell of CSV, with an apostrophe (see `unguarded`) if a spreadsheet would evaluate it."""
     return f"'{text}" if _FORMULA.match(text.lstrip("'")) else text
 
 

@@ -32,10 +32,7 @@ TRIAL_FILES = ("task.json", "controller.json", "controller.npz", "model.csv")
 
 
 def write_files(folder: Path, experiment: Experiment, opened: OpenTrial) -> list[str]:
-    """Write the task, the controller and the model's trajectory of a trial into a folder, either all files or none.
-
-    Only a controller that is affine feedback is written. Returns the names of the files.
-    """
+    """Write the files of a trial into a folder, all or none; return their names. Only affine feedback is written."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
@@ -64,7 +61,7 @@ def write_files(folder: Path, experiment: Experiment, opened: OpenTrial) -> list
 
 
 class KnownRun(NamedTuple):
-    """An earlier execution, as a file describes it: the place of the description, the task, and the result."""
+    """An earlier execution: the place of its description in a file, the task, and the result."""
 
     where: str
     parameters: Mapping[str, Any]
@@ -217,10 +214,7 @@ def tell_result(campaign: Campaign, experiment: Experiment, trial: OpenTrial | i
 
 
 def result_sentence(trial: Trial, units: str = "", start: StartOffset | None = None, inputs: str | None = None) -> str:
-    """Return the result of a trial that has ended, in one sentence without its full stop.
-
-    The start and the inputs say how a recording differs from its task and its controller.
-    """
+    """Return the result of a trial in one sentence, with how its recording differs from its task and controller."""
     if trial.state == "unmeasured":
         return f"trial {trial.number} is stored without a distance: {trial.failure}"
     if trial.distance is None:

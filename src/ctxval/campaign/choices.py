@@ -84,21 +84,14 @@ class Execution:
     def before_failure(
         cls, validation: Validation, plan: Plan, trajectory: object, failed: str, start_tolerance: float | None = None
     ) -> Execution:
-        """Return a failed execution with the steps before the failure, and what their distance is at least.
-
-        Raises:
-            InputError: if no step of the task was recorded.
-        """
+        """Return a failed execution with its steps before, one at least, and what their distance is at least."""
         tolerance = validation.start_tolerance if start_tolerance is None else start_tolerance
         recorded = recorded_before_failure(plan, trajectory, tolerance)
         least = least_distance(validation, plan.parameters.points, plan.model_trajectory, recorded)
         return cls(replace(recorded, ended=text_of(failed)), failed=failed, at_least=least)
 
     def measured(self, validation: Validation, plan: Plan, start_tolerance: float | None = None) -> Execution:
-        """Return the execution with its distance, after the checks of :meth:`Validation.accept`.
-
-        Of one that failed, the steps before the failure remain.
-        """
+        """Return the execution with its distance (:meth:`Validation.accept`), or the steps before its failure."""
         if self.failed is not None and self.trajectory is not None:
             try:
                 ended = self.before_failure(validation, plan, self.trajectory, self.failed, start_tolerance)

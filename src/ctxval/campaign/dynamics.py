@@ -11,18 +11,14 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.latest import Latest
 from ctxval._util.progress import stage
 from ctxval._util.texts import parted, reason_of
 from ctxval.campaign.history import executed_trials, largest_distance, waiting_points
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates.dynamics import bound_of, draws_for
 from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, failed, jumps
-from ctxval.certificates.dynamics_evidence import (
-    CheckedPrediction,
-    DynamicsEvidence,
-    PushedDistances,
-    UntriedParameter,
-)
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, PushedDistances, UntriedParameter
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory
@@ -37,11 +33,10 @@ from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
 
-PREDICTION = "prediction"
-"""Key of the prediction of an execution in the note of its trial."""
+PREDICTION = "prediction"  #: key of the prediction of an execution in the note of its trial
+NEAR = 0.02  #: a task that differs from an executed one by less than this in every coordinate is no new one
 
-NEAR = 0.02
-"""A task that differs from an executed one by less than this in every coordinate is no new one."""
+_Known = Latest[tuple[object, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None]]
 
 
 def prediction_in(note: Mapping[str, Any] | None) -> ExecutionPrediction | None:
@@ -54,15 +49,11 @@ class CampaignDynamics:
     """The dynamics learned from the trials of a campaign. The system is never executed.
 
     Users' parts run here at states that no execution has reached, so any exception of theirs means that nothing is
-    learned or predicted; it must not end a campaign.
+    learned or predicted; it must not end a campaign. ``failure`` is the last one in words.
 
-    Attributes:
-        experiment: a digest of the description and of how often the distance has changed; a stored prediction belongs
-            to one experiment.
-        elsewhere: returns recordings of the same system that belong to no trial of this campaign. They teach the
-            dynamics, and they are no executions of this model's controllers.
-        study: learns the dynamics.
-        failure: the exception because of which the last :meth:`evidence` was None, in words; None if there was none.
+    A stored prediction belongs to one ``experiment``, a digest of the description and of how often the distance has
+    changed. ``elsewhere`` returns recordings of the same system that belong to no trial of this campaign: they teach
+    the dynamics, and they are no executions of this model's controllers.
     """
 
     def __init__(self, validation: Validation, store: Store, seed: int, description: Mapping[str, Any]) -> None:
@@ -75,25 +66,22 @@ class CampaignDynamics:
         self.elsewhere: Callable[[], Sequence[Trajectory]] = tuple
         self.failure: str | None = None
         self._parts: tuple[str, bytes] | None = None  # of the study, when it learned first
-        self._learned: dict[tuple[object, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None]] = {}
+        self._learned: _Known = Latest(6)
 
     def use_quantile(self, quantile: float) -> None:
         """State the share of the executions of a task that distances are about, if the system is noisy."""
         if quantile != self.study.quantile:
-            self.study = self.study.anew(quantile)
-            self._learned = {}
+            self.study, self._learned = self.study.anew(quantile), Latest(6)
 
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
         """Return what the completed trials, and unless ``alone`` other recordings teach; None if it is nothing."""
         executed, others = executed_trials(self._store, trials), () if alone else self.elsewhere()
         if self._parts is not None and self._parts != self.study.state_of_parts():  # they were changed in place
-            self.study, self._learned, self._parts = self.study.anew(), {}, None
+            self.study, self._learned, self._parts = self.study.anew(), Latest(6), None
         # The other recordings are kept with what they taught, so that their identities stay theirs. A result may be
         # replaced, and then has another distance.
         key = (*((trial.number, trial.distance) for trial, _ in executed), *map(id, others))
         if key not in self._learned:
-            if len(self._learned) == 6:
-                del self._learned[next(iter(self._learned))]
             learned, failure = None, None
             try:
                 self._parts = self._parts or self.study.state_of_parts()
@@ -132,17 +120,13 @@ class CampaignDynamics:
         return replace(prediction, otherwise=fallback, pending=Pending(waiting, after))
 
     def _as_if(self, learned: LearnedDynamics, executed: Executed, waiting: Array) -> LearnedDynamics | None:
-        """Return what is learned as if tasks ``(k, d)`` had been executed as predicted; None if it cannot be said."""
         try:
             return self.study.as_if_executed(learned, executed, learned.trajectories(waiting), self.elsewhere())
         except Exception:  # users' parts
             return None
 
     def predict(self, trials: Sequence[Trial], point: Array, *, alone: bool = False) -> ExecutionPrediction | None:
-        """Return the prediction of an execution at a point ``(d,)`` of the unit cube; None if there is none.
-
-        It is learned from completed trials, with ``alone`` from no other recordings.
-        """
+        """Return the prediction at a point ``(d,)``, with ``alone`` from trials alone; None if there is none."""
         try:
             with stage("predicting the execution", unit="closed loops"):
                 learned = self.learned(trials, alone=alone)
@@ -170,10 +154,7 @@ class CampaignDynamics:
                 return None
 
     def evidence(self, trials: Sequence[Trial], confidence: float, *, keep: bool = False) -> DynamicsEvidence | None:
-        """Return what the learned dynamics say about d*, with a confidence; None if nothing can be learned.
-
-        With ``keep``, the store keeps it with the trials that it follows from.
-        """
+        """Return what the learned dynamics say about d*, which the store may keep; None if nothing can be learned."""
         kept = self.kept_evidence(trials, confidence)
         if kept is not None:
             return kept
@@ -181,7 +162,7 @@ class CampaignDynamics:
         with stage("searching the learned dynamics", self.study.search.expected_loops(draws), "closed loops"):
             learned = self.learned(trials)
             try:
-                evidence = None if learned is None else self._whole(learned, trials, draws, confidence)
+                evidence = None if learned is None else self._whole(learned, trials, confidence)
             except Exception as error:  # users' parts
                 self.failure, evidence = reason_of(error), None
         if keep and evidence is not None and not self.elsewhere():
@@ -199,9 +180,8 @@ class CampaignDynamics:
         physical = "".join(f"{name} " for name in self.study.given.physical)
         return f"evidence {confidence} {self.study.quantile} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
-    def _whole(
-        self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int, confidence: float
-    ) -> DynamicsEvidence:
+    def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence:
+        draws = draws_for(confidence)
         evidence = self._evidence(learned, trials, learned.worst_case_of(draws))
         evidence = replace(
             evidence,
@@ -270,10 +250,7 @@ class CampaignDynamics:
         )
 
     def checked(self, trials: Sequence[Trial]) -> tuple[CheckedPrediction, ...]:
-        """Return the predictions of completed trials; of those without a stored one, of the last few only.
-
-        The first trials, before which nothing could be learned, have no prediction.
-        """
+        """Return the predictions of completed trials; of those without a stored one, of the last few that have any."""
         completed = [trial for trial in trials if trial.state == "completed" and trial.distance is not None]
         checked = []
         for place, trial in enumerate(completed):
@@ -320,10 +297,7 @@ class LearnedFromTrials:
     _predictions: dict[int, Prediction | None] = field(default_factory=dict, init=False)
 
     def expected(self, points: Array, before: int) -> Array:
-        """Return predicted distances ``(m,)`` at points ``(m, d)``, learned from the trials with smaller numbers.
-
-        They are NaN if a task cannot be predicted, or if the trials teach nothing.
-        """
+        """Return distances ``(m,)`` at points ``(m, d)`` predicted from trials with smaller numbers; NaN if unknown."""
         if before not in self._predictions:
             earlier = [trial for trial in self.trials if trial.number < before]
             self._predictions[before] = self.study.prediction(earlier)

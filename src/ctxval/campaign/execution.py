@@ -30,16 +30,10 @@ class ExecutionLoop:
     The rule returns None if there is no choice at present; it is called again after an execution has ended. Without a
     budget, only the rule ends the loop.
 
-    Args:
-        recorder: opens and closes the trials.
-        rule: chooses the tasks.
-        pool: the workers; None for this process.
-        on_trial: called with each trial that has ended.
-        budget: largest total number of executions, including earlier ones.
-        expected: their expected number if there is no budget, for the display of the progress.
-        independent: whether the choices depend on no result, so that they are made before earlier executions end.
-        retries: largest number of repetitions of one execution if its worker is lost.
-        retry_failures: the same if the system fails.
+    Without a pool, tasks are executed in this process. The budget is the largest total number of executions, including
+    earlier ones; without one, progress is shown of the expected number. If the choices are independent of results, they
+    are made before earlier executions end. An execution is repeated at most so many times if its worker is lost
+    (``retries``) or if the system fails (``retry_failures``).
     """
 
     def __init__(
@@ -66,10 +60,7 @@ class ExecutionLoop:
         self.stopped: BaseException | None = None
 
     def run(self) -> None:
-        """Execute to the end, as the only process that runs the store.
-
-        If an error or Ctrl-C stops the loop, it first waits for the running executions, which were paid for.
-        """
+        """Execute to the end, alone on the store; after an error or Ctrl-C, running executions are waited for."""
         recorder = self.recorder
         with recorder.store.sole_writer(), Interrupts() as interrupts, exits_as_exceptions():
             recorder.refresh()
@@ -122,10 +113,11 @@ class ExecutionLoop:
                     chosen = self._next()
                 if chosen is None:
                     return
-                if isinstance(chosen, Choice) and self.independent and most > 1:
-                    opened = self.recorder.open_all(self._choices(chosen, most), attempts=1)
+                if isinstance(chosen, Choice):
+                    choices = self._choices(chosen, most if self.independent else 1)
+                    opened = self.recorder.open_all(choices, attempts=1)
                 else:
-                    opened = [self.recorder.start(chosen)]
+                    opened = [self.recorder.start_again(chosen)]
                 for each in opened:
                     self._start(each)
                 if idle <= 0:
@@ -205,11 +197,9 @@ class ExecutionLoop:
         try:
             execution = execution.measured(self.recorder.validation, opened.plan)
         except (ExecutionError, InputError) as error:
-            failed = Execution(failed=str(error))
+            failed, validation = Execution(failed=str(error)), self.recorder.validation
             with suppress(InputError):
-                failed = Execution.before_failure(
-                    self.recorder.validation, opened.plan, execution.trajectory, str(error)
-                )
+                failed = Execution.before_failure(validation, opened.plan, execution.trajectory, str(error))
             execution = replace(failed, seconds=execution.seconds)
         if execution.failed is not None:
             self.failures[opened.number] += 1

@@ -92,8 +92,7 @@ class ExecutorPool(WorkerPool):
 
     def _result(self, job: Any) -> Execution:
         try:
-            execution: Execution = job.result()
-            return execution
+            return job.result()  # type: ignore[no-any-return]
         except (Exception, cf.CancelledError) as error:
             if _is_loss(error):
                 self._await_scheduler()

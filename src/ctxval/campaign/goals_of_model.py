@@ -15,10 +15,7 @@ class GoalWarning(UserWarning):
 
 
 class GoalsOfModel:
-    """Watches the plans of a campaign and warns once if M misses a goal; nothing is planned for this.
-
-    Nothing is said of tasks without a goal, and of synthesizers that do not tell which states they bring to a goal.
-    """
+    """Warns once if M misses a goal in the plans of a campaign, if the synthesizer tells which states have one."""
 
     def __init__(self, validation: Validation) -> None:
         self._validation = validation

@@ -68,7 +68,7 @@ def described_plainly(value: Any) -> Any:
 
 
 def with_distance(description: dict[str, Any], distance: Any) -> dict[str, Any]:
-    """Return a description with the description of another distance."""
+    """Return a description with that of another distance."""
     return {**description, "validation": {**description["validation"], "distance": distance}}
 
 
@@ -186,9 +186,6 @@ def _changed_distance(store: Store, validation: Validation, samples: Sequence[Tr
 
 def _equal(before: Any, after: Any) -> bool:
     return bool(np.isclose(after, before, rtol=1e-6, atol=1e-12))
-
-
-# Another distance
 
 
 def remeasure(store: Store, validation: Validation, description: dict[str, Any]) -> list[Trial]:

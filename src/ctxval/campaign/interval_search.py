@@ -60,7 +60,7 @@ _FAILING = 6  # of so many last predictions, at least half must hold
 class IntervalSearch:
     """Chooses the next task until the interval of d* decides."""
 
-    recorder: TrialRecorder  #: the recorder of the trials
+    recorder: TrialRecorder
     options: CertificateOptions  #: the certificate that bounds d*: ``auto``, ``dynamics``, ``posterior`` or ``anytime``
     budget: int  #: the largest total number of executions
     threshold: float | None = None  #: tau, in the distance's units; None if there is none
@@ -253,9 +253,8 @@ class IntervalSearch:
         steady = Steadiness(self.recorder.dynamics.study.planner, None if learned is None else learned.expected)
         # Failed ones count twice: without a reason, they are not repeated, although a start may jump next to them.
         failed = [trial for trial in trials if trial.state == "failed"]
-        known = self._points([*self._ended, *failed])
+        known, waiting = self._points([*self._ended, *failed]), waiting_points(trials)
         point = next_task(evidence, known, best, limit, confidence, steady, self._near)
-        waiting = waiting_points(trials)
         if len(waiting) and (point is None or np.abs(waiting - point).max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.
             if learned is not None:
@@ -279,9 +278,8 @@ class IntervalSearch:
 
     def _lacks_tests_alone(self, evidence: DynamicsEvidence) -> bool:
         """Return whether nothing but tests is missing for a validation, as far as a few posterior samples say."""
-        bound = self._bound(evidence)
-        missing = only_tests_missing(evidence, self.best, bound)
-        missing = missing or only_a_failed_test(evidence, self.best, bound, self.limit)
+        best, bound = self.best, self._bound(evidence)
+        missing = only_tests_missing(evidence, best, bound) or only_a_failed_test(evidence, best, bound, self.limit)
         return max(bound, evidence.highest) <= self.limit and missing
 
     def _fails(self, evidence: DynamicsEvidence) -> bool:

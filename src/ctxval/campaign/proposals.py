@@ -34,6 +34,8 @@ from ctxval.errors import CtxvalError, InputError
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.searches import BaseSearch, SequentialSearch
 
+Note = dict[str, Any] | None
+
 _MOVED = 0x6D6F  # identifies the random stream of moves away from tasks that are not steady
 _DRAW, _HYPERCUBE = 0x6175, 0x6879  # those of independent draws, and of Latin hypercubes
 
@@ -55,10 +57,7 @@ class Steadiness:
         return sum(not steady for steady in self._tested.values())
 
     def __call__(self, point: Array) -> bool:
-        """Return whether rounding a task ``(d,)``, or moving it by 1e-9 of its ranges, hardly changes its distance.
-
-        After too many tests it is false, and the task does not count as rejected.
-        """
+        """Return whether rounding a task ``(d,)``, or moving it by 1e-9 of its ranges, hardly changes its distance."""
         key, space = point.tobytes(), self.planner.validation.space
         if space.members is not None:
             return True  # there are no tasks next to it
@@ -92,10 +91,7 @@ class Steadiness:
         return point if steady is None else steady
 
     def _pushed_loops(self, points: Array) -> Array:
-        """Return the states of M, disturbed by 1 % of their ranges in each step, as shares of these ranges.
-
-        The shape is ``(m, (H + 1) n)``; NaN if the loop of a task is not known.
-        """
+        """Return states ``(m, (H + 1) n)`` of M pushed by 1 % of their ranges a step, as shares of these; else NaN."""
         model, pushed = self.planner.validation.model, list[tuple[Rows, Array]]()
         for planned in self.planner.plan(points):
             ranges = np.ptp(planned.promised.states.reshape(-1, planned.promised.states.shape[-1]), axis=0)
@@ -118,11 +114,8 @@ class Proposals:
     def __init__(self, validation: Validation, search: BaseSearch, dynamics: CampaignDynamics) -> None:
         self._validation, self._search, self._dynamics = validation, search, dynamics
 
-    def next(self, trials: Sequence[Trial], rejected: int = 0) -> tuple[Array, dict[str, Any] | None]:
-        """Return the search's next point ``(d,)``, tested and rounded, and its note.
-
-        The point of an earlier trial stays, and independent draws are only rounded.
-        """
+    def next(self, trials: Sequence[Trial], rejected: int = 0) -> tuple[Array, Note]:
+        """Return the search's next point ``(d,)``, tested and rounded unless an earlier trial has it, and its note."""
         search, steady = self._search, Steadiness(self._dynamics.study.planner)
         with stage("choosing a task", unit="designs") if search.uses_prediction else nullcontext():
             if search.uses_prediction:
@@ -149,11 +142,13 @@ class Proposals:
         Guesses of a search that knows nothing are random; far apart, and mostly with parameters at their bounds, they
         teach more. The first task is that of the search, also if others follow at once.
         """
-        known = any(trial.distance is not None for trial in trials)
-        waiting = waiting_points(trials)
-        if known or not len(waiting) or not self._search.uses_prediction:
-            return None
-        if self._dynamics.prediction(trials) is not None:
+        known, waiting = any(trial.distance is not None for trial in trials), waiting_points(trials)
+        if (
+            known
+            or not len(waiting)
+            or not self._search.uses_prediction
+            or self._dynamics.prediction(trials) is not None
+        ):
             return None
         rng = np.random.default_rng([len(trials), _MOVED])
         tasks = rng.random((512, waiting.shape[1]))
@@ -161,7 +156,7 @@ class Proposals:
         gaps = np.linalg.norm(tasks[:, None] - waiting, axis=2).min(axis=1)
         return np.asarray(tasks[gaps.argmax()])
 
-    def tested(self, choice: Choice, trials: Sequence[Trial]) -> tuple[Array, dict[str, Any] | None]:
+    def tested(self, choice: Choice, trials: Sequence[Trial]) -> tuple[Array, Note]:
         """Return the point ``(d,)`` of a choice that another part has made, rounded and tested, and its note."""
         assert choice.unit_point is not None
         if choice.parameters is not None or choice.origin == "iid":
@@ -169,7 +164,7 @@ class Proposals:
         steady = Steadiness(self._dynamics.study.planner) if choice.rejected is None else None
         return self._final(choice.unit_point, trials, steady, choice.note, choice.rejected or 0)
 
-    def _asked(self) -> tuple[Array, dict[str, Any] | None]:
+    def _asked(self) -> tuple[Array, Note]:
         """Return the point ``(d,)`` that the search proposes, and its note, which is stored as JSON."""
         asked, dimension = self._search.ask(1), self._validation.space.dimension
         point: Array = np.empty(0)
@@ -177,10 +172,8 @@ class Proposals:
             if np.isrealobj(asked):
                 point = np.asarray(asked, dtype=np.float64)
         if point.shape != (1, dimension) or not ((point >= 0) & (point <= 1)).all():
-            raise InputError(
-                f"a search must return points of the unit cube, shape (1, {dimension}), "
-                f"got {shortened(repr(asked), 200)}."
-            )
+            got = shortened(repr(asked), 200)
+            raise InputError(f"a search must return points of the unit cube, shape (1, {dimension}), got {got}.")
         note, reserved = self._search.note(), (PREDICTION, CONVERGED, UNSTEADY)
         if isinstance(note, dict) and set(reserved) & set(note):
             raise InputError(f"the note of a search must not have the keys {enumerated(reserved, 10)}.")
@@ -190,17 +183,9 @@ class Proposals:
         raise InputError(f"the note of a search must be a dictionary of plain values for JSON, got {note!r}.")
 
     def _final(
-        self,
-        point: Array,
-        trials: Sequence[Trial],
-        steady: Steadiness | None,
-        note: dict[str, Any] | None,
-        rejected: int,
-    ) -> tuple[Array, dict[str, Any] | None]:
-        """Return the task to execute for a point ``(d,)``, and its note with the number of tasks that were rejected.
-
-        It is a steady task, if that is tested, and rounded; of a suite, the nearest task that is left.
-        """
+        self, point: Array, trials: Sequence[Trial], steady: Steadiness | None, note: Note, rejected: int
+    ) -> tuple[Array, Note]:
+        """Return a steady task (if tested), rounded or left of a suite; its note counts the rejected ones."""
         remaining = remaining_tasks(self._validation, trials)
         if steady is not None:
             # On M itself, no distance depends on how a controller would react to errors of M; a suite has no others.
@@ -215,11 +200,10 @@ class Proposals:
 
 
 class IndependentDraws:
-    """The random numbers of the independent draws of one campaign.
+    """The random numbers of the independent draws of one campaign, which depend on the seed and on the model.
 
-    They depend on the seed, so that a study can be repeated. They also depend on the model: otherwise, a model that was
-    learned again with the results of an audit would be audited by the same tasks. The store keeps the number that
-    depends on the model, so that a campaign continues with the same draws on another machine.
+    Otherwise, a model that was learned again with the results of an audit would be audited by the same tasks. The store
+    keeps the number of the model, so that a campaign continues with the same draws on another machine.
     """
 
     def __init__(self, store: Store, validation: Validation, seed: int) -> None:
@@ -231,10 +215,7 @@ class IndependentDraws:
         return space.rounded(space.unit_draws(1, self._generator(len(trials), _DRAW))[0])
 
     def test(self, trials: Sequence[Trial]) -> Array:
-        """Return the next point ``(d,)`` of the Latin hypercubes of tests; it depends on no result.
-
-        Of a suite, the task that is left and nearest to it is executed.
-        """
+        """Return the next point ``(d,)`` of the Latin hypercubes of tests, whatever the results are."""
         block, row = divmod(spread_tests(trials), TESTS)
         points = latin_hypercube(TESTS, self._validation.space.dimension, self._generator(block, _HYPERCUBE))
         return np.asarray(points[row])

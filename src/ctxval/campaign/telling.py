@@ -26,11 +26,8 @@ from ctxval.systems.subprocess import run_supervised
 
 _PROGRAM = Path(__file__).absolute().with_name("recording_process.py")
 
-REFUSED = 3
-"""Exit status of the confined process if the file cannot be used; its output is the reason."""
-
-Names = Mapping[str, str]
-"""The names of states or inputs with their units."""
+REFUSED = 3  #: exit status of the confined process if the file cannot be used; its output is the reason
+Names = Mapping[str, str]  #: the names of states or inputs with their units
 
 
 @dataclass(frozen=True)
@@ -123,9 +120,8 @@ def _require_finite(path: Path, recording: Trajectory, states: Names, inputs: Na
     """Refuse a complete recording with a number that is missing, infinite or a mark; the message says where."""
     if recording.ended != COMPLETE:
         return  # the reason why it ended is reported instead
-    advice = (
-        "If the execution has no usable recording, report it as failed: with --failed, or in that column of a table."
-    )
+    failed = "report it as failed: with --failed, or in that column of a table"
+    advice = f"If the execution has no usable recording, {failed}."
     for names, values in ((list(states), recording.states), (list(inputs), recording.inputs)):
         wrong = np.argwhere(~np.isfinite(values[:, : len(names)]))
         if len(wrong):

@@ -36,15 +36,9 @@ from ctxval.searches import BaseSearch, Search, SequentialSearch
 class TrialRecorder:
     """Opens and closes the trials of one campaign; the search knows exactly the trials in the store.
 
-    Attributes:
-        validation: the map p -> d(p), which :meth:`remeasure` replaces.
-        store: the store of the trials, after a check that it belongs to this experiment.
-        description: what identifies the experiment in a store, in the form that JSON returns.
-        search: with the optional methods of :class:`ctxval.searches.BaseSearch`.
-        draws: chooses the points of an audit.
-        dynamics: what the trajectories teach of the dynamics.
-        executing: the numbers of the trials that this process is executing.
-        predicts: whether executions are predicted, and the predictions stored, before they are made.
+    The store was checked to belong to the experiment, which the description identifies in the form that JSON returns;
+    ``executing`` has the numbers of the trials that this process executes, and ``predicts`` tells whether executions
+    are predicted, and the predictions stored, before they are made.
     """
 
     def __init__(
@@ -161,16 +155,14 @@ class TrialRecorder:
         """Store a new trial that people execute."""
         return self.open_all([choice], attempts=0)[0]
 
-    def start(self, chosen: Choice | Trial) -> OpenTrial:
-        """Store that an execution starts: the first one of a new trial, or a repetition of an interrupted trial."""
-        if isinstance(chosen, Choice):
-            return self.open_all([chosen], attempts=1)[0]
+    def start_again(self, trial: Trial) -> OpenTrial:
+        """Store that the execution of an interrupted trial starts again."""
         try:
-            plan = self.plan(chosen)
+            plan = self.plan(trial)
         except CtxvalError as error:
-            self.close(chosen, Execution(failed=text_of(error)), executed=False)
+            self.close(trial, Execution(failed=text_of(error)), executed=False)
             raise
-        return self.repeat(OpenTrial(chosen, plan))
+        return self.repeat(OpenTrial(trial, plan))
 
     def repeat(self, opened: OpenTrial) -> OpenTrial:
         """Store that another execution of an open trial starts."""
@@ -266,10 +258,7 @@ class TrialRecorder:
     def close(
         self, trial: Trial, execution: Execution, *, replacing: str | None = None, executed: bool = True
     ) -> Trial:
-        """Store a measured execution; return the trial in its final state.
-
-        The trial is open, unless there is a reason for ``replacing`` its result.
-        """
+        """Store a measured execution of an open trial, or one ``replacing`` a result; return the final trial."""
         ended = execution.ended(trial, executed=executed)
         trajectory = execution.trajectory
         if replacing is not None:
@@ -290,18 +279,17 @@ class TrialRecorder:
 
     def close_together(self, executions: Sequence[tuple[Trial, Execution]]) -> list[Trial]:
         """Store measured executions of open trials in one transaction; if an error is raised, none is stored."""
-        ended = [execution.ended(trial) for trial, execution in executions]
-        trajectories = (execution.trajectory for _, execution in executions)
-        self.store.close_trials(zip(ended, trajectories, strict=True), changes=self._changes)
-        self._closed(ended)
-        return ended
+        ended = [(execution.ended(trial), execution.trajectory) for trial, execution in executions]
+        self.store.close_trials(ended, changes=self._changes)
+        return self._closed([trial for trial, _ in ended])
 
-    def _closed(self, ended: Sequence[Trial]) -> None:
+    def _closed(self, ended: list[Trial]) -> list[Trial]:
         for trial in ended:
             self.executing.discard(trial.number)
             self._trials[trial.number] = trial
             if trial.distance is not None:
-                self._tell_search([trial])
+                self.search.tell(np.array([trial.unit_point]), [trial.distance])
+        return ended
 
     def add(self, executions: Sequence[tuple[Plan, Execution]], wait: float = 0.0) -> list[Trial | None]:
         """Store earlier executions in one transaction; return their trials, None if one is already in the store."""
@@ -326,9 +314,8 @@ class TrialRecorder:
                 trials.append(trial)
                 new.append((trial, plan.model_trajectory, execution.trajectory))
                 advance(1)
-            if new:
+            if added := [trial for trial, _, _ in new]:
                 self.store.add(new, changes=self._changes)
-                added = [trial for trial, _, _ in new]
                 self._trials += added
                 self._tell_search(added)
         return trials
@@ -345,9 +332,8 @@ class TrialRecorder:
     @contextmanager
     def not_executing(self, trial: Trial) -> Iterator[None]:
         """Refuse the result of a trial that a process is executing: that process records the result."""
-        refusal = InputError(
-            f"trial {trial.number} is being executed: its result cannot be recorded before the execution has ended."
-        )
+        until = "its result cannot be recorded before the execution has ended."
+        refusal = InputError(f"trial {trial.number} is being executed: {until}")
         if trial.number in self.executing:
             raise refusal
         if not trial.attempts:

@@ -20,9 +20,7 @@ from ctxval.learning.run_statistics import DISTANCE, RunStatistics, names
 if TYPE_CHECKING:
     from ctxval.campaign.campaign import Campaign
 
-FALSE_ALARMS = 1e-3
-"""Usual rate of false alarms: one in 1,000 executions."""
-
+FALSE_ALARMS = 1e-3  #: usual rate of false alarms: one in 1,000 executions
 _MOST = 24  # certified executions that are predicted from the others, the latest ones: each is learned from anew
 
 
@@ -48,9 +46,8 @@ class Watch:
         self._trials = [trial for trial, _ in executed]
         self._executed = [(trial.unit_point, trajectory) for trial, trajectory in executed]
         if len(executed) < FEWEST:
-            raise CertificateError(
-                f"a watch needs at least {FEWEST} executions with trajectories in the store, got {len(executed)}."
-            )
+            needs = f"at least {FEWEST} executions with trajectories in the store, got {len(executed)}"
+            raise CertificateError(f"a watch needs {needs}.")
         learned = dynamics.learned(campaign.trials, alone=True)
         if learned is None:
             why = dynamics.failure or "the model explains them all, or they cannot be predicted"
@@ -76,10 +73,9 @@ class Watch:
                 channels.append(WatchedChannel(name, tuple(each.value for each in runs), freedom, information))
         self.state = WatchState(threshold, false_alarms, tuple(channels))
         if state is not None:
-            begun = self.state
             settings = len(state.channels), state.threshold, state.false_alarms
             # It follows from the same beginning, up to the rounding of another processor.
-            same = settings == (len(channels), begun.threshold, begun.false_alarms) and all(
+            same = settings == (len(channels), threshold, false_alarms) and all(
                 known.name == channel.name
                 and len(known.certified) == len(channel.certified)
                 and np.allclose(known.certified, channel.certified, rtol=1e-4)
@@ -112,9 +108,8 @@ class Watch:
         execution = Execution(run) if isinstance(run, Trajectory) else run
         trajectory, distance, validation = execution.trajectory, execution.distance, self.campaign.validation
         if trajectory is None:
-            raise InputError(
-                "a watch needs the trajectory of an execution; a distance or a failure alone says nothing."
-            )
+            advice = "a distance or a failure alone says nothing"
+            raise InputError(f"a watch needs the trajectory of an execution; {advice}.")
         point = None
         if parameters is None:
             self._require_states(trajectory)

@@ -32,10 +32,7 @@ from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import CampaignError, InputError
 
 _GRACE_PERIOD = 2.0  # seconds that a worker has to clean up before it is killed
-
-AHEAD = 0.5
-"""Seconds of work that is begun before its turn, if its choice depends on no result; Ctrl-C waits for it."""
-
+AHEAD = 0.5  #: seconds of work that is begun before its turn, if its choice depends on no result; Ctrl-C waits for it
 _BATCH = 128  # largest number of tasks that are executed in one call
 _TERMINATED = 143  # exit status of a worker that ended after SIGTERM, as in shells
 
@@ -58,11 +55,7 @@ def timed_out(timeout: float, seconds: float) -> Execution:
 
 
 class WorkerPool(ABC):
-    """Workers that execute one plan each.
-
-    Attributes:
-        size: the number of workers.
-    """
+    """``size`` workers that execute one plan each."""
 
     size: int
 
@@ -210,8 +203,7 @@ class ProcessPool(WorkerPool):
     def _received(self, worker: _Worker) -> Execution:
         """Return what an execution gave: if its process has ended, a failure if the system ended it, else a loss."""
         try:
-            execution: Execution = pickle.loads(worker.pipe.recv_bytes())
-            return execution
+            return pickle.loads(worker.pipe.recv_bytes())  # type: ignore[no-any-return]
         except (EOFError, OSError, pickle.UnpicklingError):
             self._stop([worker])
         status = worker.process.exitcode
@@ -272,7 +264,7 @@ def _exit_on_signal(_signal: int, _frame: FrameType | None) -> None:
 
 
 def _leave_once() -> bool:
-    """Ignore signals from now on, because the worker ends; return whether it had not yet begun to end.
+    """Ignore signals, because the worker ends; return whether it had not yet begun to end.
 
     An exception while a forked process ends would let it go on where it was forked, as a copy of the campaign.
     """

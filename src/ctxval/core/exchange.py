@@ -26,8 +26,7 @@ from ctxval.errors import InputError, ShapeError
 CONTROLLER_FORMAT, TASK_FORMAT, VERSION = "ctxval controller", "ctxval task", 1
 LAW = "u = min(max(inputs[t] + gains[t] (x - states[t]), low), high) at the steps t = 0, ..., horizon - 1"
 
-Names = Mapping[str, str]
-"""The names of states or inputs, and their units."""
+Names = Mapping[str, str]  #: the names of states or inputs, and their units
 
 
 @dataclass(frozen=True, eq=False)

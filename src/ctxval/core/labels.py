@@ -46,8 +46,7 @@ def require_names(states: Iterable[str], inputs: Iterable[str]) -> None:
             raise InputError(f"each state and input needs {wanted}, {reason}.")
 
 
-TIMES = ("t", "time")
-"""Names of the column of times in a recording."""
+TIMES = ("t", "time")  #: names of the column of times in a recording
 
 
 def labels_of(named: Mapping[str, str]) -> tuple[str, ...]:

@@ -53,9 +53,8 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
     require_times(trajectory, plan.task.times[: expected.horizon + 1])
     if trajectory.states.shape != expected.states.shape or trajectory.inputs.shape != expected.inputs.shape:
         wanted = f"states {expected.states.shape} and inputs {expected.inputs.shape}"
-        raise ShapeError(
-            f"the trajectory must have {wanted}, got {trajectory.states.shape} and {trajectory.inputs.shape}."
-        )
+        got = f"{trajectory.states.shape} and {trajectory.inputs.shape}"
+        raise ShapeError(f"the trajectory must have {wanted}, got {got}.")
     start = expected.states[0]  # the initial state of the task, or its outputs
     ranges = np.ptp(expected.states, axis=0)
     scale = np.maximum(np.maximum(ranges, np.abs(start)), max(0.05 * ranges.max(), 1e-6))
@@ -206,14 +205,10 @@ def require_repeatable(validation: Validation, plan: Plan) -> None:
 
 @dataclass(frozen=True)
 class StartOffset:
-    """How far an execution starts from the initial state of its task.
+    """How far an execution starts from the initial state of its task."""
 
-    The size is as the distance measures differences of states, or the largest of all states if that is unknown. The
-    text names the state whose offset is largest.
-    """
-
-    size: float
-    text: str
+    size: float  #: as the distance measures differences of states, or the largest of all states if that is unknown
+    text: str  #: the largest offset of a state, with the name of the state
 
 
 def start_offset(validation: Validation, point: ArrayLike, trajectory: Trajectory) -> StartOffset:

@@ -6,11 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-QUANTILE = 0.9
-"""The share q of the executions of a task that a statement on a noisy system is about, by default."""
-
-LEVELS = np.sort([*np.linspace(0.0, 1.0, 21), 0.975, 0.99, 0.995])
-"""Levels of the quantiles."""
+QUANTILE = 0.9  #: the share q of the executions of a task that a statement on a noisy system is about, by default
+LEVELS = np.sort([*np.linspace(0.0, 1.0, 21), 0.975, 0.99, 0.995])  #: levels of the quantiles
 
 
 def chance_of_more(quantiles: Sequence[float], value: float, runs: int) -> float:

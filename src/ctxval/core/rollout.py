@@ -27,10 +27,8 @@ def rollout(step: Step, controller: Controller, task: Task, *, partial: bool = F
         pi = started(controller, task)
         u = np.asarray(pi(0, x), dtype=np.float64)
         if u.shape[:-1] != x.shape[:-1] or u.ndim != x.ndim:
-            wanted = ", ".join([*map(str, x.shape[:-1]), "m"])
-            raise ShapeError(
-                f"the controller must return inputs of shape ({wanted}{',' * (x.ndim == 1)}), got {u.shape}."
-            )
+            wanted = ", ".join([*map(str, x.shape[:-1]), "m"]) + "," * (x.ndim == 1)
+            raise ShapeError(f"the controller must return inputs of shape ({wanted}), got {u.shape}.")
         states = np.empty((task.horizon + 1, *x.shape))
         inputs = np.empty((task.horizon, *u.shape))
         states[0], of_states, of_inputs = x, x.shape, u.shape

@@ -55,13 +55,10 @@ def flips(points: Array, inputs: Sequence[Array]) -> Flips | None:
 
 @dataclass(frozen=True, eq=False)
 class InputSaturation:
-    """How often inputs are at their limits: the share of the steps for each input, shape ``(m,)``.
-
-    The limits are ``known`` if the synthesizer states them; otherwise they are taken from the inputs themselves.
-    """
+    """How often inputs are at their limits: the share of the steps for each input, shape ``(m,)``."""
 
     shares: Array
-    known: bool
+    known: bool  # whether the synthesizer states the limits; otherwise they are taken from the inputs themselves
 
 
 def saturation(inputs: Sequence[Array], synthesizer: Synthesizer | None) -> InputSaturation | None:
@@ -87,14 +84,11 @@ def saturation(inputs: Sequence[Array], synthesizer: Synthesizer | None) -> Inpu
 
 @dataclass(frozen=True, eq=False)
 class GoalMisses:
-    """How far M ends from the goals of tasks, in the k states that its controllers bring to a goal and d compares.
-
-    The misses ``(N, k)`` are errors of final states; the shares are these over the range of each state in all tasks.
-    """
+    """How far M ends from the goals of tasks, in the k states that its controllers bring to a goal and d compares."""
 
     states: Rows
-    misses: Array
-    shares: Array
+    misses: Array  # errors of final states, ``(N, k)``
+    shares: Array  # these over the range of each state in all tasks
 
     @property
     def missed(self) -> Mask:

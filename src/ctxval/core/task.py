@@ -103,9 +103,7 @@ class Task:
     def stacked(tasks: Sequence[Task]) -> Task:
         """Return single tasks with one horizon and one time step as a batch."""
         first, names = tasks[0], [task.name for task in tasks]
-        starts, references = (
-            np.stack([getattr(task, part) for task in tasks]) for part in ("initial_state", "reference")
-        )
+        starts, references = (np.stack([getattr(task, of) for task in tasks]) for of in ("initial_state", "reference"))
         around = {key: np.stack([task.environment[key] for task in tasks]) for key in first.environment}
         return first._like(starts, references, np.array(names) if any(names) else "", around)
 

@@ -19,8 +19,7 @@ from ctxval.core.space import Parameters, Point, TaskSpace
 from ctxval.core.task_distribution import Continuous, Sampler
 from ctxval.errors import InputError, UnknownNameError
 
-SUITE = "_tasks"
-"""Key of the tasks in the description of a suite; no parameter can have this name."""
+SUITE = "_tasks"  #: key of the tasks in the description of a suite; no parameter can have this name
 
 TASK = "task"
 """The name of a task, by which trials, tables and command lines call it; and the category of tasks with names alone."""
@@ -194,8 +193,6 @@ def _by_name(tasks: Any) -> dict[str, dict[str, Any]]:
         raise InputError("a parameter of a suite must not be called 'task': that is the name of each task.")
     for name, values in others:
         if set(values) != set(first[1]):
-            have, wanted = enumerated(values, 6) or "none", enumerated(first[1], 6)
-            raise InputError(
-                f"all tasks of a suite must have the same parameters: {first[0]!r} has {wanted}, {name!r} has {have}."
-            )
+            have = f"{first[0]!r} has {enumerated(first[1], 6)}, {name!r} has {enumerated(values, 6) or 'none'}"
+            raise InputError(f"all tasks of a suite must have the same parameters: {have}.")
     return by_name

@@ -84,10 +84,8 @@ class Trajectory:
         times, states, inputs = self.times.shape, self.states.shape, self.inputs.shape
         axes = len(times) == 1 and len(states) >= 2 and len(inputs) == len(states) and states[:-2] == inputs[:-2]
         if not axes or states[-2] != times[0] or inputs[-2] != times[0] - 1:
-            got = f"{times}, {states} and {inputs}"
-            raise ShapeError(
-                f"a trajectory needs times (H+1,), states (..., H+1, n) and inputs (..., H, m), got {got}."
-            )
+            wanted = "times (H+1,), states (..., H+1, n) and inputs (..., H, m)"
+            raise ShapeError(f"a trajectory needs {wanted}, got {times}, {states} and {inputs}.")
 
     @property
     def horizon(self) -> int:
@@ -120,9 +118,8 @@ class Trajectory:
 
     def first(self, steps: int) -> Trajectory:
         """Return the first steps."""
-        return Trajectory(
-            self.times[: steps + 1], self.states[..., : steps + 1, :], self.inputs[..., :steps, :], self.ended
-        )
+        states, inputs = self.states[..., : steps + 1, :], self.inputs[..., :steps, :]
+        return Trajectory(self.times[: steps + 1], states, inputs, self.ended)
 
     def transitions(self) -> Transitions:
         """Return all steps of all tasks of the batch as one set of transitions."""

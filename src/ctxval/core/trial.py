@@ -26,8 +26,7 @@ CONVERGED = "converged"
 UNSTEADY = "unsteady"
 """Key in the note of a trial: the number of tasks that were not executed because their controllers jump."""
 
-AT_LEAST = "at_least"
-"""Key in the note of a failed trial: the distance that the steps before the failure have already."""
+AT_LEAST = "at_least"  #: key in the note of a failed trial: the distance that the steps before the failure have already
 
 TOLD_ALONE = "its distance was told without a trajectory, and the distance has changed since: execute the task again."
 """The failure of a trial that was reported without a trajectory, so that a new distance cannot be computed."""
@@ -94,24 +93,18 @@ def designs_sentence(trials: Sequence[Trial]) -> str | None:
 
 @dataclass(frozen=True)
 class Change(ShortRepr):
-    """A later change of a store: its kind, the reason that the user gave, and the previous values or the differences.
-
-    The time is in UTC; it is empty until the change is stored.
-    """
+    """A later change of a store: its kind, the user's reason, and the previous values or the differences."""
 
     what: str
     why: str
     content: dict[str, Any]
-    at: str = ""
+    at: str = ""  #: the time in UTC; empty until the change is stored
 
 
 @dataclass(frozen=True)
 class StatedThreshold(ShortRepr):
-    """A threshold that was stated to a campaign: its value, and how many distances were known when it was first stated.
-
-    The time is in UTC.
-    """
+    """A threshold that was stated to a campaign, and how many distances were known when it was first stated."""
 
     threshold: float
     distances: int
-    at: str = ""
+    at: str = ""  #: the time in UTC

@@ -379,5 +379,4 @@ def _failing_as(kind: type[CtxvalError], part: str) -> Iterator[None]:
         raise kind(f"{part} failed: {reason_of(error)}.") from error
 
 
-_stated: WeakSet[Validation] = WeakSet()
-"""The validations whose cost was stated."""
+_stated: WeakSet[Validation] = WeakSet()  # the validations whose cost was stated

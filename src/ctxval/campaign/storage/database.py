@@ -18,12 +18,7 @@ from ctxval.errors import CtxvalError, ForeignStoreError, StoreAccessError
 
 
 class Database:
-    """A SQLite file with the tables of a store; opening a new one makes them.
-
-    Attributes:
-        path: the absolute path of the file; None if the tables are in memory.
-        name: the name of the store in messages.
-    """
+    """A SQLite file with the tables of a store, made if it is new; its path is absolute, None in memory."""
 
     def __init__(self, path: str | Path | None = None) -> None:
         # Absolute, because an executed system may change the current folder of the process.
@@ -79,10 +74,7 @@ class Database:
 
     @contextmanager
     def sole_writer(self, wait: float = 0.0) -> Iterator[None]:
-        """Prevent other processes from running this store; wait so many seconds for one that is running it.
-
-        The lock is released when the process ends, however it ends.
-        """
+        """Prevent other processes from running this store; wait so many seconds for one that is running it."""
         if self.path is None or self._locked:
             yield
             return

@@ -55,11 +55,7 @@ def sync_folder(folder: Path) -> None:
 def error_with_fallback(
     ended: Trial, trajectory: Trajectory | None, store: Path | None, error: CtxvalError
 ) -> CtxvalError:
-    """Write the fallback file of an execution; return the error of the store with a sentence that names the file.
-
-    It has the trajectory as NPZ, or the distance or failure as JSON, and lies next to the store, or in the temporary
-    folder if this is not possible.
-    """
+    """Write what an execution gave to a file next to the store or a temporary one; return an error that names it."""
     if not ended.executed:
         return error
     if trajectory is None:

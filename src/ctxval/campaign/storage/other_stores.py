@@ -18,8 +18,7 @@ from ctxval.campaign.storage.store import Store
 from ctxval.certificates import Neighbour, Provenance
 from ctxval.core.trial import Trial
 
-STORE_SUFFIXES = (".sqlite", ".sqlite3", ".db")
-"""Suffixes of files that are taken for stores."""
+STORE_SUFFIXES = (".sqlite", ".sqlite3", ".db")  #: suffixes of files that are taken for stores
 _UNREADABLE = (sqlite3.Error, OSError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
 
 
@@ -32,9 +31,9 @@ def provenance_of_store(store: Store) -> Provenance:
 
 
 def other_stores(path: Path) -> list[Neighbour]:
-    """Return the other stores in a store's folder with trials of the same validation and model, of any search and seed.
+    """Return other stores beside a store with trials of the same validation and model, each with its worst trial.
 
-    Each comes with its worst trial. Nothing is built, run or written. Files that cannot be read are skipped.
+    Nothing is built, run or written. Files that cannot be read are skipped.
     """
     others = []
     with suppress(*_UNREADABLE):

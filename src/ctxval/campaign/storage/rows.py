@@ -17,8 +17,7 @@ from ctxval.errors import InputError
 COLUMNS = "number, origin, state, unit_point, parameters, attempts, executed, distance, failure, seconds, note, because"
 """Columns of a trial, in the order that :func:`read_trial` takes."""
 
-Side = Literal["model", "system"]
-"""Whose trajectory it is."""
+Side = Literal["model", "system"]  #: whose trajectory it is
 
 
 def row_of(trial: Trial) -> tuple[Any, ...]:

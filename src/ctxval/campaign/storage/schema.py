@@ -110,15 +110,12 @@ def require_files(path: Path) -> None:
             if reason := why_not_regular(os.lstat(real + ending).st_mode):
                 what = f"{real}{ending} {reason.removeprefix('it ')}"
                 raise StoreAccessError(f"{path} cannot be read as a store: {what}; move it away.")
-    end = b""
     with suppress(OSError), open(f"{real}-journal", "rb") as file:
         file.seek(-8, os.SEEK_END)
-        end = file.read()
-    # The end of the journal of a transaction over several databases, which a store never makes.
-    if end == b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7":
-        raise ForeignStoreError(
-            f"{path} cannot be read as a store: {real}-journal belongs to several databases; move it away."
-        )
+        # The end of the journal of a transaction over several databases, which a store never makes.
+        if file.read() == b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7":
+            why = f"{real}-journal belongs to several databases; move it away"
+            raise ForeignStoreError(f"{path} cannot be read as a store: {why}.")
 
 
 def require_file(path: Path) -> None:

@@ -24,8 +24,7 @@ from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAcces
 
 _DRAWS, _THRESHOLDS = "draws", "thresholds"  # keys in the table experiment that do not describe the experiment
 
-CAUSE = "cause"
-"""Key of what is computed of the cause of a model's error: a text, for reports."""
+CAUSE = "cause"  #: key of what is computed of the cause of a model's error: a text, for reports
 
 
 @checked
@@ -134,11 +133,10 @@ class Store(Database):
 
     def keep_settings(self, settings: dict[str, Any]) -> None:
         """Store the settings that make the experiment again, for commands that get only the store."""
-        if self.settings() == json.loads(json.dumps(settings)):
-            return
-        with self._transaction():
-            self._execute("DELETE FROM settings")
-            self._insert_pairs("settings", settings)
+        if self.settings() != json.loads(json.dumps(settings)):
+            with self._transaction():
+                self._execute("DELETE FROM settings")
+                self._insert_pairs("settings", settings)
 
     def settings(self) -> dict[str, Any]:
         """Return the settings that make the experiment again; empty if no command made the store."""
@@ -214,9 +212,8 @@ class Store(Database):
                 row = row_of(trial)
                 values = (*row, checksum_of(row), now(), None if trial.state == "open" else now())
                 places = ", ".join("?" * len(values))
-                self._execute(
-                    f"INSERT INTO trials ({COLUMNS}, checksum, opened_at, closed_at) VALUES ({places})", values
-                )
+                columns = f"{COLUMNS}, checksum, opened_at, closed_at"
+                self._execute(f"INSERT INTO trials ({columns}) VALUES ({places})", values)
                 self._write_trajectory(trial.number, "model", model_trajectory)
                 self._write_trajectory(trial.number, "system", system_trajectory)
 
@@ -257,11 +254,10 @@ class Store(Database):
         row = dict(zip(COLUMNS.split(", "), row_of(trial), strict=True))
         values = (*(row[name] for name in columns), checksum_of(row_of(trial)), closed_at, trial.number)
         assignments = f"{' = ?, '.join(columns)} = ?, checksum = ?, closed_at = coalesce(?, closed_at)"
-        if self._execute(f"UPDATE trials SET {assignments} WHERE number = ? {where}", values).rowcount == 1:
-            return
-        row = self._execute("SELECT state FROM trials WHERE number = ?", (trial.number,)).fetchone()
-        state = "not open" if row is None else "being executed by another process" if row[0] == "open" else row[0]
-        raise InputError(f"trial {trial.number} is {state}, so nothing more can be told of it.")
+        if self._execute(f"UPDATE trials SET {assignments} WHERE number = ? {where}", values).rowcount != 1:
+            row = self._execute("SELECT state FROM trials WHERE number = ?", (trial.number,)).fetchone()
+            state = "not open" if row is None else "being executed by another process" if row[0] == "open" else row[0]
+            raise InputError(f"trial {trial.number} is {state}, so nothing more can be told of it.")
 
     def trials(self) -> list[Trial]:
         """Return all trials in their order. Raises a :class:`ForeignStoreError` if one is damaged."""
@@ -343,15 +339,13 @@ class Store(Database):
                     self._memory += _size(self._kept.pop(number)[1])
         executed = dict[int, Trajectory]()
         for number in numbers:
-            if number not in self._kept:
-                checksum, trajectory = self._read_trajectory(number, side)
-                if _size(trajectory) <= self._memory:  # to drop an older one would not help: all are read in turn
-                    self._memory -= _size(trajectory)
-                    self._kept[number] = checksum, trajectory
-                    for array in () if trajectory is None else (trajectory.times, trajectory.states, trajectory.inputs):
-                        array.setflags(write=False)
-            else:
-                trajectory = self._kept[number][1]
+            checksum, trajectory = self._kept.get(number) or self._read_trajectory(number, side)
+            # To drop an older one would not help: all are read in turn.
+            if number not in self._kept and _size(trajectory) <= self._memory:
+                self._memory -= _size(trajectory)
+                self._kept[number] = checksum, trajectory
+                for array in () if trajectory is None else (trajectory.times, trajectory.states, trajectory.inputs):
+                    array.setflags(write=False)
             if trajectory is not None:
                 executed[number] = trajectory
         return executed
