@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ctxval._util.representation import ShortRepr
-from ctxval.certificates.base import Certificate
 from ctxval.certificates.bounds import Quantities
 from ctxval.certificates.dynamics_evidence import LearnedDistance
-from ctxval.certificates.sentences import verdicts as sentences
 from ctxval.certificates.sentences import withdrawals
 from ctxval.core.space import DISTRIBUTION, TaskSpace
 from ctxval.core.task_distribution import distribution_text
@@ -85,15 +83,6 @@ class Provenance(ShortRepr):
             beside=tuple(beside),
         )
 
-    def caution(self, threshold: float) -> str:
-        """Return what speaks against any answer, each as a sentence after a space; empty if nothing does."""
-        above = [(other.path.name, other.worst) for other in self.beside if other.worst and other.falsifies(threshold)]
-        caution = sentences.falsified_beside(above, threshold, self.quantities)
-        if self.start is not None and self.start[0] > threshold:
-            limit = self.quantities.of(f"{threshold:.6g}")
-            caution += f" The start of an execution was off by {self.start[1]}; the threshold is {limit}."
-        return caution
-
     def known_before(self, threshold: float, trials: Sequence[Trial]) -> int:
         """Return how many distances were known when a threshold was first stated; 0 if no thresholds were recorded."""
         if self.thresholds is None:
@@ -101,28 +90,10 @@ class Provenance(ShortRepr):
         first = (stated.distances for stated in self.thresholds if stated.threshold == threshold)
         return next(first, sum(trial.distance is not None for trial in trials))
 
-    def looked(self, certificate: Certificate, threshold: float, trials: Sequence[Trial], volume: float = 0.0) -> str:
-        """Return, as the end of a sentence, whether a validated threshold was chosen after looking; empty if not."""
-        stated = [each.threshold for each in self.thresholds or ()]
-        before = stated[: stated.index(threshold)] if threshold in stated else stated
-        smaller = sorted(each for each in before if each < threshold and not certificate.covers(each, volume))
-        largest = max((trial.distance or 0.0 for trial in trials), default=0.0)
-        return sentences.looked(self.known_before(threshold, trials), smaller, largest, self.quantities)
-
-    def alone(self, threshold: float, trials: Sequence[Trial]) -> list[str]:
-        """Return what a validation rests on besides its certificate: that neither tau nor the campaign was selected."""
-        falsifying = [other.path.name for other in self.beside if other.falsifies(threshold)]
-        return sentences.not_selected(self.known_before(threshold, trials), len(self.beside), falsifying)
-
     @property
     def quantities(self) -> Quantities:
         """The units and tasks of sentences."""
         return Quantities(self.units, self.space)
-
-    @property
-    def stated(self) -> tuple[str, ...]:
-        """The remarks that are the user's word, on which a validation rests."""
-        return tuple(remark for remark in self.remarks if remark != withdrawals.REFINED)
 
 
 def _space_of(described: Mapping[str, Any]) -> TaskSpace | None:

@@ -121,9 +121,8 @@ def judge_by(
         why_not = sentences.undecided(certificate, tau, volume, quantities)
         return Verdict("undecided", tau, why_not, certificate=certificate, expected=certificate.expected)
     conditions = (kind or by_name).rests_on(certificate, known.space)
-    alone = known.alone(tau, trials)
-    rests_on = sentences.rests_on(conditions, certificate, tau, quantities, known.stated, alone)
-    looked = known.looked(certificate, tau, trials, volume)
+    rests_on = sentences.rests_on(conditions, certificate, tau, known, trials)
+    looked = sentences.looked(known, certificate, tau, trials, volume)
     reason = f"{sentences.validated(certificate, tau, quantities).removesuffix('.')}{looked}."
     return Verdict("validated", tau, reason, certificate=certificate, rests_on=rests_on)
 
@@ -157,7 +156,7 @@ def judge(
     if verdict.answer != "falsified" and bets is not None and bets.above:
         parts.append(sentences.noise_may_explain(bets, float(threshold), known.quantities))
     reason = "; ".join(str(part) for part in parts if part is not None)
-    return replace(verdict, reason=f"{reason}.{known.caution(threshold)}")
+    return replace(verdict, reason=f"{reason}.{sentences.caution(known, threshold)}")
 
 
 def _certified(
@@ -165,11 +164,9 @@ def _certified(
 ) -> Certificate:
     """Return a certificate, for a threshold if there is one. Most kinds see countable draws only."""
     suite = None if known.space is None else known.space.members
-    sample = replace(
-        Sample.of(trials, known.learned), distribution=known.distribution, suite=suite, threshold=threshold
-    )
-    kind = options.kind
-    if sample.suite is not None:
+    sample, kind = Sample.of(trials, known.learned), options.kind
+    sample = replace(sample, distribution=known.distribution, suite=suite, threshold=threshold)
+    if suite is not None:
         require_suite(kind)
     # No statement may count draws whose number depended on their distances.
     sample = sample if kind.sorts_draws else sample.with_countable_draws()
@@ -222,14 +219,13 @@ def assess(
     falsified = None
     if threshold is not None:
         falsified = counterexample(trials, threshold, known.quantities, options.confidence, kind.quantile)
-    if threshold is not None and falsified is None:
-        verdict = judge(trials, threshold, options, known)
-        if verdict.certificate is None:
-            raise CertificateError(verdict.reason)
-        return Assessment(kind.name, verdict.certificate, verdict)
-    limit = threshold if kind.uses_threshold else None
+        if falsified is None:
+            verdict = judge(trials, threshold, options, known)
+            if verdict.certificate is None:
+                raise CertificateError(verdict.reason)
+            return Assessment(kind.name, verdict.certificate, verdict)
     try:
-        certificate = _certified(trials, options, known, limit)
+        certificate = _certified(trials, options, known, threshold if kind.uses_threshold else None)
     except CertificateError as error:
         if falsified is None:
             raise
