@@ -14,15 +14,7 @@ from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.posterior import Diagnosis, Posterior, diagnose, instantaneous_bound
 from ctxval.certificates.provenance import Neighbour, Provenance
 from ctxval.certificates.sample import PLANNED, MadeGood, Sample, require_learned
-from ctxval.certificates.scenario import (
-    Audit,
-    Region,
-    SamplingDiscarding,
-    Scenario,
-    samples_needed,
-    tail,
-    volume_bound,
-)
+from ctxval.certificates.scenario import Audit, Region, SamplingDiscarding, Scenario, samples_needed, tail, volume_bound
 from ctxval.certificates.stopping import StoppingDecision, StoppingRule
 from ctxval.certificates.verdict import Assessment, Verdict, assess, judge, judge_by
 from ctxval.core.coverage import StateInputCoverage, StateInputGap, UntriedCorner

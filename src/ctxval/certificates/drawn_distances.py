@@ -40,10 +40,7 @@ class DrawnDistances(ShortRepr):
         return np.asarray(np.maximum(np.where(self.known, self.draws, 0.0).std(axis=0), FLOOR * threshold))
 
     def factor(self, threshold: float, confidence: float) -> float:
-        """Return k: the order statistic of the largest standardised excesses of the draws.
-
-        It is at least 1, because nothing is claimed to be known better than the least spread.
-        """
+        """Return k: the order statistic of the largest standardised excesses of the draws; at least 1."""
         known, spread = self.known, self.spread(threshold)
         excess = ((self.draws - self.mean)[:, known] / spread[known]).max(axis=1, initial=0.0)
         return max(1.0, float(np.sort(excess)[rank_within(confidence, len(excess)) - 1]))
@@ -58,11 +55,7 @@ class DrawnDistances(ShortRepr):
         )
 
     def leaving(self, most: float) -> Array:
-        """Return how far loops leave the records or cross the boundary ``(K,)``: nothing is known of those above 1.
-
-        Args:
-            most: by how much loops may leave the records, as a share of the visited range.
-        """
+        """Return how far loops leave the records, as a share of ``most``, or cross the boundary ``(K,)``."""
         # Both have the same slope: smaller slopes cost more of the set, because their errors reach farther.
         beyond = self.beyond if self.crossed is None else np.maximum(self.beyond, most + self.crossed)
         return np.asarray(np.minimum(beyond / most, LARGEST))

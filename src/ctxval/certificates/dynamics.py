@@ -3,13 +3,12 @@ r"""The bound from learned dynamics: the posterior of ``d* = max_p d(p)`` under 
 The residual ``r(x, u) = x' - M(x, u)`` has a Gaussian-process prior with unknown hyperparameters. Each draw r_s from
 its posterior makes a system ``M + r_s``, whose largest distance d*_s is searched over all tasks. Under the prior, d*
 and these S maxima are exchangeable, so d* is at most the k-th smallest one with probability ``k / (S + 1)``. Draws
-that share hyperparameters make this approximate. Bayes' rule does not depend on how the tasks were chosen. If M is
-rougher than the system, a linear model takes its place in r (:mod:`ctxval.learning.residual_data`).
+that share hyperparameters make this approximate. If M is rougher than the system, a linear model takes its place in r
+(:mod:`ctxval.learning.residual_data`).
 
-The bound lies if the prior is wrong: if a state is not recorded, or the dynamics jump. So it is withdrawn by
-:mod:`ctxval.certificates.dynamics_diagnostics` unless predictions that were made before executions held, and unless the
-records cover what the closed loops visit. It is raised by half of the largest excess of the last executions over their
-predictions, and by far more if one of these predictions failed.
+The bound lies if the prior is wrong: if a state is not recorded, or the dynamics jump. So
+:mod:`ctxval.certificates.dynamics_diagnostics` withdraws it unless predictions held that were made before executions,
+and unless the records cover what the closed loops visit, and raises it if predictions failed.
 """
 
 from __future__ import annotations

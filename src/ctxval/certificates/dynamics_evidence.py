@@ -241,10 +241,7 @@ class LearnedDistance(Protocol):
         """Return distances ``(m,)``, or NaN, at points ``(m, d)`` of the unit cube, predicted from earlier trials."""
 
     def dynamics(self, confidence: float, quantile: float = QUANTILE) -> DynamicsEvidence | None:
-        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned.
-
-        The confidence sets the least number of posterior samples. Users' code raises a CertificateError.
-        """
+        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned."""
 
     def tasks(self, count: int, seed: int) -> Array:
         """Return draws from the distribution of tasks, independent of trials: points ``(count, d)``."""

@@ -100,10 +100,7 @@ class Envelope(ShortRepr):
     _bounds: Array | None = None
 
     def trusted(self, task: Mapping[str, Any] | ArrayLike) -> Any:
-        """Return whether tasks are trusted: of a mapping by name a bool, of points ``(..., d)`` of the space ``(...)``.
-
-        Tasks outside of the task space are not trusted.
-        """
+        """Return whether tasks are trusted: of a mapping by name a bool, of points ``(..., d)`` a mask ``(...)``."""
         return np.isfinite(self.bound(task))
 
     def bound(self, task: Mapping[str, Any] | ArrayLike) -> Any:
@@ -216,10 +213,8 @@ def _raised(
 ) -> tuple[float, int | None]:
     """Return k, and the trial that raised it; None if it is that of the draws.
 
-    It is at least the largest standardised excess of the predictions that count, and the largest standardised error of
-    the draws at the tasks that they were learned from. They hardly miss any if the next state is a function of what is
-    recorded. Stiff contacts and hidden states are missed in both directions, so a distance that is too small counts as
-    well: it is too large elsewhere. Nothing is claimed of tasks that the draws have above the threshold.
+    The draws hardly miss any task that they were learned from if the next state is a function of what is recorded.
+    Stiff contacts and hidden states are missed in both directions, so a distance that is too small counts as well.
     """
     factor, rises = drawn.factor(threshold, confidence), rises_of(evidence, threshold)
     if evidence.quantile is None:  # else noise explains the differences
@@ -334,11 +329,7 @@ def envelope_of(
 
 
 def _of_suite(
-    envelope: Envelope,
-    suite: TaskSuite,
-    drawn: DrawnDistances,
-    most: float,
-    executed: Sequence[tuple[Array, float]],
+    envelope: Envelope, suite: TaskSuite, drawn: DrawnDistances, most: float, executed: Sequence[tuple[Array, float]]
 ) -> Envelope:
     threshold, bounds = envelope.threshold, np.full(len(suite), np.inf)
     uncovered = np.zeros(len(suite), dtype=np.bool_)

@@ -71,10 +71,7 @@ class Surfaces:
         return cls(points, weights, left_out, errors)
 
     def without(self, outside: Array, checked: int) -> Surfaces:
-        """Return these surfaces with larger errors, so that hardly any of the points ``(n, d)`` outside is inside.
-
-        These are the points above a limit, of all that were checked and were below the limits by these surfaces.
-        """
+        """Return these surfaces with larger errors, so that hardly any of the points ``(n, d)`` outside is inside."""
         for multiple in _MULTIPLES:
             raised = replace(self, errors=multiple * self.errors)
             if (raised(outside) <= 1).all(axis=-1).sum() <= FALSE * checked:

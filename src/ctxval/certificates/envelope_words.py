@@ -122,10 +122,7 @@ def _sides(space: TaskSpace) -> tuple[list[str], Array]:
 
 
 def _grown(start: Array, outside: Array, ends: Array, speeds: Array, reach: float) -> Array:
-    """Return the limits ``(2, m)`` of a box around values ``(m,)`` that grows in all sides until none can grow.
-
-    Each side has a speed, in ranges. It stops at a share of the way to the task outside that it would meet.
-    """
+    """Return the limits ``(2, m)`` of a box around values; each side grows at its speed until tasks outside stop it."""
     away = (outside - start) / ((ends[1] - ends[0]) * speeds)  # times at which a side meets each task
     box = ends.copy()
     blocked = np.ones(len(outside), dtype=bool)  # tasks that no side keeps out yet

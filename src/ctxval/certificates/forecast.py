@@ -44,10 +44,8 @@ def forecast(
 ) -> Forecast:
     """Return how many more executions of GP-UCB decide whether d* is at most the threshold, from draws of d*.
 
-    Each future takes one draw of the hyperparameters, from those whose draws of d* exceed the threshold if there are
-    any. It draws a true distance function from the posterior on candidate tasks, and searches it with GP-UCB. It is
-    decided when a distance above the threshold is executed, or when the upper bound falls to the threshold. The bound
-    keeps the number of standard deviations above the mean that it has now.
+    Each future takes one draw of the hyperparameters, from those that exceed the threshold if there are any. It
+    searches a draw of the distance on candidate tasks, until a distance exceeds the threshold or the bound keeps it.
     """
     rng = np.random.default_rng(seed)
     in_the_way = maxima.owners[maxima.draws > threshold]

@@ -1,14 +1,12 @@
 r"""The Gaussian-process bound: the posterior of ``d* = max_p d(p)`` given all trials, however they were chosen.
 
 The bound is an order statistic of draws of d*. Under the prior, S independent draws and the truth are exchangeable, so
-the truth is at most the k-th smallest draw with probability ``k / (S + 1)``. Here groups of draws share
-hyperparameters, so this holds approximately. Bayes' rule does not depend on why a task was chosen or why the campaign
-stopped, so the bound holds after adaptive sampling. It rests on the prior, so it is withdrawn if the trials contradict
-the process or do not cover the tasks (:func:`diagnose`). Each trial is predicted from those before it. Under the
-process, the standardised error of each prediction follows a t distribution, and these errors are independent, whatever
-chose the tasks (recursive residuals; Brown, Durbin and Evans 1975). The order of trials that people chose or imported
-has no meaning, so each of them is predicted from all others. Its standardised error follows a t distribution as well
-(externally studentised residuals; Cook and Weisberg 1982), if the tasks were not chosen by the distances.
+the truth is at most the k-th smallest draw with probability ``k / (S + 1)``; groups of draws share hyperparameters, so
+this holds approximately. The bound is withdrawn if the trials contradict the process or do not cover the tasks
+(:func:`diagnose`). Each trial is predicted from those before it: the standardised errors are independent and follow t
+distributions, whatever chose the tasks (recursive residuals; Brown, Durbin and Evans 1975). The order of trials that
+people chose or imported has no meaning, so each of them is predicted from all others (externally studentised residuals;
+Cook and Weisberg 1982).
 """
 
 from __future__ import annotations
@@ -57,10 +55,7 @@ class Posterior(CertificateKind):
     resolution: PositiveFloat = RESOLUTION
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return the bound that d* stays below with the confidence, under the prior and given the trials.
-
-        There are enough draws for the threshold, and a forecast if the bound is above that.
-        """
+        """Return the bound that d* stays below with the confidence, and a forecast if it is above the threshold."""
         threshold = sample.threshold
         # Many trials that do not cover the tasks are refused before the draws, which take long.
         if len(sample) > MOST and (farthest := farthest_task(sample.points)) > self.resolution:
@@ -128,10 +123,7 @@ class Posterior(CertificateKind):
 
 
 def instantaneous_bound(sample: Sample) -> dict[str, float] | None:
-    """Return the largest UCB of the paper's GP with estimated hyperparameters, and its gap to the best distance found.
-
-    It is below d* about as often as above. It is None if fewer than two distances are known.
-    """
+    """Return the largest UCB of the paper's GP, and its gap to the best distance; None if fewer than two are known."""
     try:
         surrogate = fit_surrogate(sample.points, sample.distances)
     except InputError:

@@ -1,26 +1,20 @@
 r"""Scenario and sampling-and-discarding bounds, exact (the paper's Sec. IV-A; Campi and Garatti 2011 with d = 1).
 
-Of N independent draws from the task space, discard the k largest distances; h is the largest that is left. The volume
-V = Pr(d(p) > h) then has, for a continuous distribution of d, the law of the (k+1)-th smallest of N uniform draws,
-Beta(k + 1, N - k), so that
+Of N independent draws from the task space, discard the k largest distances; h is the largest that is left. For the
+volume V = Pr(d(p) > h),
 
-    Pr(V > eps) = sum_{i=0}^{k} binom(N, i) eps^i (1 - eps)^(N - i),
+    Pr(V > eps) <= sum_{i=0}^{k} binom(N, i) eps^i (1 - eps)^(N - i),
 
-and for any distribution Pr(V > eps) is at most that. The paper's sum ends at k - 1, which is too small: for k = 0 it
-would be empty, so a single draw would bound d on the whole task space.
+with equality for a continuous distribution of d. The paper's sum ends at k - 1, which is too small (docs/theory.md).
 
 An audit is the scenario bound of the independent draws among trials of any origin. It assumes nothing about how the
 distance depends on the task, or about how the worst known task was found.
 
-A region bound bounds the distance by a prediction d_hat plus a margin q, but for a share of the tasks. Let d_hat be
-fixed before N independent tasks are drawn, and let q be the (k+1)-th largest of d(p_i) - d_hat(p_i). The scenario bound
-holds for any function of the task, so also for the excess d - d_hat. A task whose distance is not known, or cannot be
-predicted, has an infinite excess. Split conformal prediction computes the same margin (Vovk 2012; Campi and
-Garatti 2011 for k > 0).
-
-The tasks with d_hat(p) + q <= tau are a map of where tau is kept. Its share is estimated from predicted tasks, which
-need no execution: of M tasks, j lie outside the map, and the Clopper-Pearson bound of their share is the same function
-of M, j and the confidence. The volume above tau is at most eps and this bound together.
+A region bound is the scenario bound of the excess d - d_hat over a prediction that is fixed before: the margin q is the
+(k+1)-th largest excess. A task whose distance is not known, or cannot be predicted, has an infinite excess. Split
+conformal prediction computes the same margin (Vovk 2012; Campi and Garatti 2011 for k > 0). The tasks with d_hat(p) + q
+<= tau are a map of where tau is kept. Of M predicted tasks, j lie outside the map, and the Clopper-Pearson bound of
+their share is the same function of M, j and the confidence. The volume above tau is at most eps plus this bound.
 """
 
 from __future__ import annotations
@@ -69,9 +63,7 @@ class Scenario(CertificateKind):
     def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
         """Return a bound on the volume of the tasks whose distance exceeds the largest one left after discarding.
 
-        A failed execution counts as a violation, larger than any distance, so it must be among the discarded ones. A
-        CertificateError is raised if a trial is no independent draw, or if the number of draws depended on their
-        distances.
+        A failed execution counts as a violation, larger than any distance, so it must be among the discarded ones.
         """
         discarded = self._require_discard()
         foreign = [origin for origin in sample.origins if origin != "iid"]
@@ -219,10 +211,8 @@ class Audit(CertificateKind):
     def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
         """Return a bound on the volume of the tasks whose distance exceeds the largest one known.
 
-        Let h be the largest of N independent distances. The volume of tasks above h is bounded for any distance
-        function. The largest distance of all trials is at least h, so the volume above it is not larger, however those
-        trials were chosen. Only draws count whose number was chosen before they were executed
-        (:attr:`Sample.countable`), and none may have failed.
+        The largest distance of all trials is at least that of the draws, so the volume above it is not larger. Only
+        :attr:`Sample.countable` draws count, and none may have failed.
         """
         drawn = countable_draws(sample, "an audit")
         if drawn.failed:
@@ -278,10 +268,7 @@ class Region(CertificateKind):
         """Bound the distance by a prediction plus a margin from independent draws, but for a share of the tasks.
 
         With a threshold, the bound is the threshold, and the volume left out is that of the draws plus that of the
-        tasks at which the prediction plus the margin exceeds the threshold. Without one, the bound is the largest
-        predicted one.
-
-        More draws than are discarded must have a distance and a prediction; else a CertificateError is raised.
+        tasks at which prediction plus margin exceeds it. Without one, the bound is the largest predicted one.
         """
         threshold = sample.threshold
         beta = 1 - confidence

@@ -79,9 +79,8 @@ def counterexample(
 ) -> Verdict | None:
     """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it.
 
-    Of a failed execution, the distance of the steps before the failure counts, but less than that of whole executions.
-
-    With noise, a single one does not suffice (:mod:`ctxval.certificates.bets`), except in a suite, executed once.
+    The distance of the steps before a failure counts, but less than that of whole executions. With noise, a single one
+    does not suffice (:mod:`ctxval.certificates.bets`), except in a suite, executed once.
     """
     once = quantities.space is not None and quantities.space.members is not None
     tau, bets = float(threshold), None if once else bets_against(trials, float(threshold), quantile)

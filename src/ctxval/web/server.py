@@ -142,10 +142,7 @@ class Waiting:
 
 
 class Connection(H11Protocol):
-    """A connection of the server; h11 limits the size of headers, which httptools does not.
-
-    The application finds it as ``scope["state"]["connection"]``.
-    """
+    """A connection, which the application finds as ``scope["state"]["connection"]``; h11 limits the size of headers."""
 
     def __init__(self, waiting: Waiting, **options: Any) -> None:
         super().__init__(**options)

@@ -69,10 +69,7 @@ class Innermost:
 
 
 class PageState:
-    """What the page shows, for any number of browsers. All of it belongs to the event loop of the server.
-
-    Only what does not change of the served campaign may be read here.
-    """
+    """What the page shows, for any number of browsers; it belongs to the event loop, and so reads no store."""
 
     live = False  # whether a command executes the tasks, so that the page only shows them
     choosing: Work | None = None
@@ -109,10 +106,7 @@ class PageState:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def events(self) -> AsyncIterator[str]:
-        """Yield an event with the version of the page after each change, or with the work in progress.
-
-        A comment now and then shows that the connection is there.
-        """
+        """Yield an event with the version of the page after each change, or the work in progress, or a comment."""
         seen = None
         self.listeners += 1
         try:

@@ -180,11 +180,7 @@ def _predicted(context: ReportContext, model: DistanceModel) -> Chart:
 
 
 def _region(context: ReportContext) -> list[Markup]:
-    """Return where the threshold is kept; nothing if the certificate is of another kind or S is not known.
-
-    A task keeps it if its prediction from the trials before the independent draws, plus the margin of the certificate
-    ``region``, is at most the threshold.
-    """
+    """Return where the prediction plus the margin of a region certificate keeps the threshold; nothing without one."""
     certificate, learned, tau = context.certificate, context.provenance.learned, context.threshold
     if certificate is None or certificate.kind != "region" or learned is None or tau is None:
         return []

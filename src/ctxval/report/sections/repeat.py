@@ -91,10 +91,7 @@ def digest(value: Any) -> str:
 
 
 def repeating_command(context: ReportContext) -> str:
-    """Return the command that runs the campaign again, into a new store; empty if no command made the store.
-
-    The new store has a folder of its own, because it is no other campaign among which one is chosen.
-    """
+    """Return the command that runs the campaign again, into a store in a folder of its own; empty if none made it."""
     path = Path(path_of(context))
     return command_of(context, None, "--store", str(path.parent / "again" / path.name))
 
@@ -132,10 +129,7 @@ def run_command(settings: Mapping[str, Any], budget: int | None, *others: str, t
     }
     for option, (value, default) in values.items():
         words += [] if value is None or value == default else [option, str(value)]
-    flags = {
-        "--explore": settings.get("explore"),
-        "--decide": settings.get("explore") is False,
-    }
+    flags = {"--explore": settings.get("explore"), "--decide": settings.get("explore") is False}
     words += [flag for flag, wanted in flags.items() if wanted is True]
     for name, value in options.items():
         words += ["--option", f"{name}={value}"]

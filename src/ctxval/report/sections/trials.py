@@ -145,10 +145,7 @@ def recorded_lines(context: ReportContext, most: int = 850_000) -> RecordedLines
 
 
 def lines_of(context: ReportContext, number: int, points: int) -> dict[str, Any]:
-    """Return the lines of one trial: times, M, S minus M, corrected M minus M, and the reference.
-
-    Differences are stored, because a small error of M would vanish in the steps of the values.
-    """
+    """Return the lines of one trial: times, M, the differences of S and corrected M from M, and the reference."""
     model, system = context.recordings[number].model, context.recordings[number].system
     rows: Rows = np.arange(system.horizon + 1)
     if len(rows) > points:  # evenly spread, and those of the largest error of each state
