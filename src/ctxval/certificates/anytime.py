@@ -45,37 +45,27 @@ class AnytimeAudit(CertificateKind):
         if sample.threshold is None:
             what = "an anytime audit bounds the volume above a threshold"
             raise CertificateError(f"{what}, so it needs one (--threshold).")
-        threshold = float(sample.threshold)
-        drawn = sample.only("iid")
-        if not len(drawn):
+        threshold, drawn = float(sample.threshold), sample.only("iid")
+        n, limit = len(drawn), f"{threshold:.6g}"
+        if not n:
             raise CertificateError(
                 "an anytime audit needs independent draws of tasks, and there is none; use --audit N."
             )
         violating = ~(drawn.distances <= threshold)  # also where no distance is known
         volume = anytime_volume(violating, 1 - confidence)
+        remark = " or fail, however often this was looked at and continued"
+        statement = share_above(sample, volume, confidence, limit, n, remark)
+        audited = f"the audited tasks are independent and {distributed(sample)}"
+        fixed = f"the threshold {limit} was fixed before any of them was known"
+        assumptions = (audited, fixed, *ABOUT_DRAWS, *sample.remarks, ONE_CAMPAIGN)
+        details = {
+            "violations": int(violating.sum()),
+            "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
+            "failed": drawn.failed,
+            "failures": sample.failures,
+        }
         return Certificate(
-            kind=self.name,
-            statement=share_above(
-                *(sample, volume, confidence, f"{threshold:.6g}", len(drawn)),
-                " or fail, however often this was looked at and continued",
-            ),
-            upper_bound=threshold,
-            confidence=confidence,
-            volume=volume,
-            trials=len(drawn),
-            assumptions=(
-                f"the audited tasks are independent and {distributed(sample)}",
-                f"the threshold {threshold:.6g} was fixed before any of them was known",
-                *ABOUT_DRAWS,
-                *sample.remarks,
-                ONE_CAMPAIGN,
-            ),
-            details={
-                "violations": int(violating.sum()),
-                "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
-                "failed": drawn.failed,
-                "failures": sample.failures,
-            },
+            *(self.name, statement, threshold, confidence, volume, n, assumptions, details),
             distribution=sample.distribution,
         )
 

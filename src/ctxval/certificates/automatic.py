@@ -42,17 +42,10 @@ class WholeSuite(CertificateKind):
                 f"{missing} of {counted(sample.tasks or 0, 'task')} of the suite have no distance yet, so the largest "
                 "one is not known; `ctxval run` executes them."
             )
-        return Certificate(
-            kind=self.name,
-            statement=f"All {sample.tasks} tasks of the suite were executed, and their largest distance is "
-            f"{sample.best:.6g}.",
-            upper_bound=sample.best,
-            confidence=confidence,
-            volume=0.0,
-            trials=len(sample),
-            assumptions=(EXECUTED_AGAIN, *sample.remarks),
-            details={"best": sample.best, "tasks": sample.tasks, "failures": sample.failures},
-        )
+        h, assumptions = sample.best, (EXECUTED_AGAIN, *sample.remarks)
+        statement = f"All {sample.tasks} tasks of the suite were executed, and their largest distance is {h:.6g}."
+        details = {"best": h, "tasks": sample.tasks, "failures": sample.failures}
+        return Certificate(self.name, statement, h, confidence, 0.0, len(sample), assumptions, details)
 
 
 @part("auto")

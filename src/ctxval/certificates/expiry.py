@@ -292,14 +292,11 @@ class WatchState(ShortRepr):
     def to_json(self) -> dict[str, Any]:
         """Return all attributes and the sentence, ready for JSON."""
         names = ("threshold", "false_alarms", "evidence", "alarm", "since", "cause", "ratio")
-        channels = [
-            {
-                **{name: getattr(channel, name) for name in ("name", "certified", "freedom", "information")},
-                "later": [statistic and vars(statistic) for statistic in channel.later],
-            }
-            for channel in self.channels
-        ]
-        plain: dict[str, Any] = {
+        of_channel = ("name", "certified", "freedom", "information")
+        channels = [{name: getattr(channel, name) for name in of_channel} for channel in self.channels]
+        for described, channel in zip(channels, self.channels, strict=True):
+            described["later"] = [statistic and vars(statistic) for statistic in channel.later]
+        return {
             **{name: getattr(self, name) for name in names},
             "channels": json.loads(json.dumps(channels, default=lambda array: array.tolist())),
             "runs": list(self.runs),
@@ -307,7 +304,6 @@ class WatchState(ShortRepr):
             "expired": self.expired,
             "sentence": self.sentence,
         }
-        return plain
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:

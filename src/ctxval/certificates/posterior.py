@@ -73,53 +73,37 @@ class Posterior(CertificateKind):
     @checked
     def certify_drawn(self, sample: Sample, drawn: Maxima, confidence: Probability = 0.95) -> Certificate:
         """Return the certificate from draws of d*, which were made from the same trials."""
-        used = representative(sample)
-        stochastic = drawn.stochastic
+        used, processes, stochastic = representative(sample), drawn.conditioned, drawn.stochastic
         upper, error = drawn.upper(confidence), drawn.error(confidence)
-        unordered, d = np.array([origin == "manual" for origin in used.origins]), sample.points.shape[1]
+        manual, resolution = np.array([origin == "manual" for origin in used.origins]), self.resolution
         diagnosis = diagnose(
-            drawn.conditioned,
-            used.points,
-            used.numbers,
-            unordered=unordered,
-            resolution=self.resolution,
-            covered=sample.points,
+            processes, used.points, used.numbers, unordered=manual, resolution=resolution, covered=sample.points
         )
-        hyperparameters = [process.hyperparameters for process in drawn.conditioned]
-        rough = float(np.mean([each.nu == 1.5 for each in hyperparameters]))
-        return Certificate(
-            kind=self.name,
-            statement=posterior_statement(upper, error, confidence, stochastic=stochastic),
-            upper_bound=upper,
-            confidence=confidence,
-            volume=0.0,
-            trials=len(sample),
-            assumptions=(
-                *posterior_assumptions(sample, len(used), self.resolution, stochastic=stochastic),
-                *sample.remarks,
-                ONE_CAMPAIGN,
-            ),
-            details={
-                "best": sample.best,
-                "gap": upper - sample.best,
-                "error": error,
-                "draws": len(drawn.draws),
-                "stochastic": stochastic,
-                "resolution": {
-                    "diagonals": self.resolution,
-                    "of_each_range": self.resolution * float(np.sqrt(d)),
-                    "of_the_space": resolved_volume(self.resolution, d),
-                },
-                "instantaneous": instantaneous_bound(used),
-                "kernels": {"matern-3/2": rough, "matern-5/2": 1 - rough},
-                "logarithm": float(np.mean([np.isfinite(process.warp.offset) for process in drawn.conditioned])),
-                "length_scales": np.median(np.exp([each.log_scales for each in hyperparameters]), axis=0).tolist(),
-                "diagnosis": {name: value for name, value in vars(diagnosis).items() if name != "doubt"},
-                "failures": sample.failures,
+        hyperparameters = [process.hyperparameters for process in processes]
+        rough, d = float(np.mean([each.nu == 1.5 for each in hyperparameters])), sample.points.shape[1]
+        assumed = posterior_assumptions(sample, len(used), resolution, stochastic=stochastic)
+        details = {
+            "best": sample.best,
+            "gap": upper - sample.best,
+            "error": error,
+            "draws": len(drawn.draws),
+            "stochastic": stochastic,
+            "resolution": {
+                "diagonals": resolution,
+                "of_each_range": resolution * float(np.sqrt(d)),
+                "of_the_space": resolved_volume(resolution, d),
             },
-            doubt=both_outcomes(sample, stochastic=stochastic) or diagnosis.doubt,
-            error=error,
-        )
+            "instantaneous": instantaneous_bound(used),
+            "kernels": {"matern-3/2": rough, "matern-5/2": 1 - rough},
+            "logarithm": float(np.mean([np.isfinite(process.warp.offset) for process in processes])),
+            "length_scales": np.median(np.exp([each.log_scales for each in hyperparameters]), axis=0).tolist(),
+            "diagnosis": {name: value for name, value in vars(diagnosis).items() if name != "doubt"},
+            "failures": sample.failures,
+        }
+        statement = posterior_statement(upper, error, confidence, stochastic=stochastic)
+        doubt = both_outcomes(sample, stochastic=stochastic) or diagnosis.doubt
+        assumptions, n = (*assumed, *sample.remarks, ONE_CAMPAIGN), len(sample)
+        return Certificate(self.name, statement, upper, confidence, 0.0, n, assumptions, details, doubt, error)
 
 
 def instantaneous_bound(sample: Sample) -> dict[str, float] | None:

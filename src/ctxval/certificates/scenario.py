@@ -95,27 +95,20 @@ class Scenario(CertificateKind):
                 f"{violations(sample)}, more than the {discarded} discarded; nothing bounds them."
                 f"{advice_to_remeasure(sample)}"
             )
-        ordered = np.sort(np.nan_to_num(sample.distances, nan=np.inf))
-        h = float(ordered[len(sample) - 1 - discarded])
-        volume = volume_bound(len(sample), discarded, 1 - confidence)
+        n, ordered = len(sample), np.sort(np.nan_to_num(sample.distances, nan=np.inf))
+        h = float(ordered[n - 1 - discarded])
+        volume = volume_bound(n, discarded, 1 - confidence)
+        statement = share_above(sample, volume, confidence, at_most(h), n)
+        assumptions = (
+            *how_drawn(sample, sample, "the trials"),
+            "the number discarded was chosen before the distances were known",
+            *(UNSEEN, "each task has one distance: the system is deterministic", NO_BOUND),
+            *sample.remarks,
+            ONE_CAMPAIGN,
+        )
+        details = {"discarded": discarded, "failed": sample.failed, "failures": sample.failures}
         return Certificate(
-            kind=self.name,
-            statement=share_above(sample, volume, confidence, at_most(h), len(sample)),
-            upper_bound=h,
-            confidence=confidence,
-            volume=volume,
-            trials=len(sample),
-            assumptions=(
-                *how_drawn(sample, sample, "the trials"),
-                "the number discarded was chosen before the distances were known",
-                UNSEEN,
-                "each task has one distance: the system is deterministic",
-                NO_BOUND,
-                *sample.remarks,
-                ONE_CAMPAIGN,
-            ),
-            details={"discarded": discarded, "failed": sample.failed, "failures": sample.failures},
-            distribution=sample.distribution,
+            self.name, statement, h, confidence, volume, n, assumptions, details, distribution=sample.distribution
         )
 
     def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
@@ -220,27 +213,23 @@ class Audit(CertificateKind):
                 f"{violations(drawn)}; to audit the other tasks, start a new store whose task space excludes these "
                 f"tasks.{advice_to_remeasure(drawn)}"
             )
-        volume, h = volume_bound(len(drawn), 0, 1 - confidence), sample.best
+        n, h = len(drawn), sample.best
+        volume = volume_bound(n, 0, 1 - confidence)
         chosen = sample.distances[[origin != "iid" for origin in sample.origins]]
         largest = float(np.nanmax(chosen)) if np.isfinite(chosen).any() else None
+        statement = share_above(sample, volume, confidence, at_most(h), n, ", the largest one found")
+        assumptions = (*how_drawn(sample, drawn), *ABOUT_DRAWS, *sample.remarks, ONE_CAMPAIGN)
+        details = {
+            "largest_found": h,
+            "largest_drawn": drawn.best,
+            "largest_chosen": largest,
+            "exceeding": None if largest is None else int((drawn.distances > largest).sum()),
+            "not_counted": len(sample.only("iid")) - n,
+            "failed": sample.failed,
+            "failures": sample.failures,
+        }
         return Certificate(
-            kind=self.name,
-            statement=share_above(sample, volume, confidence, at_most(h), len(drawn), ", the largest one found"),
-            upper_bound=h,
-            confidence=confidence,
-            volume=volume,
-            trials=len(drawn),
-            assumptions=(*how_drawn(sample, drawn), *ABOUT_DRAWS, *sample.remarks, ONE_CAMPAIGN),
-            details={
-                "largest_found": h,
-                "largest_drawn": drawn.best,
-                "largest_chosen": largest,
-                "exceeding": None if largest is None else int((drawn.distances > largest).sum()),
-                "not_counted": len(sample.only("iid")) - len(drawn),
-                "failed": sample.failed,
-                "failures": sample.failures,
-            },
-            distribution=sample.distribution,
+            self.name, statement, h, confidence, volume, n, assumptions, details, distribution=sample.distribution
         )
 
 
@@ -270,12 +259,12 @@ class Region(CertificateKind):
         With a threshold, the bound is the threshold, and the volume left out is that of the draws plus that of the
         tasks at which prediction plus margin exceeds it. Without one, the bound is the largest predicted one.
         """
-        threshold = sample.threshold
-        beta = 1 - confidence
+        threshold, beta = sample.threshold, 1 - confidence
         learned, drawn = require_learned(sample, "region"), countable_draws(sample, "a region bound")
         before = min(drawn.numbers)  # the prediction is learned from the trials before the draws
         margin, unpredicted = _margin(drawn, learned.expected(drawn.points, before), before, self.discard)
-        volume = volume_bound(len(drawn), self.discard, (1 - _OF_MAP) * beta)
+        n = len(drawn)
+        volume = volume_bound(n, self.discard, (1 - _OF_MAP) * beta)
         bounds = learned.expected(learned.tasks(self.predictions, before), before) + margin
         count, unknown = len(bounds), int(np.isnan(bounds).sum())
         limit = float(bounds[~np.isnan(bounds)].max(initial=-np.inf)) if threshold is None else float(threshold)
@@ -295,37 +284,26 @@ class Region(CertificateKind):
         if threshold is not None:
             tasks = f"{100 * share:.4g} ± {at_most(100 * error, 2)} % {of_tasks(sample.distribution)}"
             kept = f"this prediction keeps {limit:.6g} on {tasks} (an estimate from {count} predicted tasks)"
+        statement = margin_and_map(sample, margin, volume, total, confidence, at_most(limit), kept)
+        chosen = "the number discarded was chosen before the draws were known"
+        assumptions = (*how_drawn(sample, drawn), chosen, FROZEN, *ABOUT_DRAWS, *sample.remarks, ONE_CAMPAIGN)
+        details = {
+            "margin": margin,
+            "discarded": self.discard,
+            "volume_of_draws": volume,
+            "learned_before": before,
+            "predictions": count,
+            "share_kept": share,
+            "share_error": error,
+            "unpredicted_draws": unpredicted,
+            "unpredicted_tasks": unknown,
+            "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
+            "not_counted": len(sample.only("iid")) - n,
+            "failed": sample.failed,
+            "failures": sample.failures,
+        }
         return Certificate(
-            kind=self.name,
-            statement=margin_and_map(sample, margin, volume, total, confidence, at_most(limit), kept),
-            upper_bound=limit,
-            confidence=confidence,
-            volume=total,
-            trials=len(drawn),
-            assumptions=(
-                *how_drawn(sample, drawn),
-                "the number discarded was chosen before the draws were known",
-                FROZEN,
-                *ABOUT_DRAWS,
-                *sample.remarks,
-                ONE_CAMPAIGN,
-            ),
-            details={
-                "margin": margin,
-                "discarded": self.discard,
-                "volume_of_draws": volume,
-                "learned_before": before,
-                "predictions": count,
-                "share_kept": share,
-                "share_error": error,
-                "unpredicted_draws": unpredicted,
-                "unpredicted_tasks": unknown,
-                "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
-                "not_counted": len(sample.only("iid")) - len(drawn),
-                "failed": sample.failed,
-                "failures": sample.failures,
-            },
-            distribution=sample.distribution,
+            self.name, statement, limit, confidence, total, n, assumptions, details, distribution=sample.distribution
         )
 
     def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:

@@ -69,6 +69,7 @@ def identity(context: ReportContext) -> dict[str, str]:
     search = context.description.get("search")
     known = ("space", "task", "system", "model", "synthesizer", "distance")
     digests = {f"digest of the {name}": digest(part) for name, part in context.parts.items() if name in known}
+    trials = [[trial.number, trial.state, trial.unit_point.tolist(), trial.distance] for trial in context.trials]
     return {
         "store": str(context.store.name),
         "search": str(search.get("type")) if isinstance(search, Mapping) else "not known",
@@ -79,9 +80,7 @@ def identity(context: ReportContext) -> dict[str, str]:
         "version of scipy": scipy.__version__,
         "processor": platform.machine(),
         **digests,
-        "digest of the trials": digest(
-            [[trial.number, trial.state, trial.unit_point.tolist(), trial.distance] for trial in context.trials]
-        ),
+        "digest of the trials": digest(trials),
     }
 
 
@@ -129,8 +128,8 @@ def run_command(settings: Mapping[str, Any], budget: int | None, *others: str, t
     }
     for option, (value, default) in values.items():
         words += [] if value is None or value == default else [option, str(value)]
-    flags = {"--explore": settings.get("explore"), "--decide": settings.get("explore") is False}
-    words += [flag for flag, wanted in flags.items() if wanted is True]
+    explore = settings.get("explore")
+    words += ["--explore"] if explore is True else ["--decide"] if explore is False else []
     for name, value in options.items():
         words += ["--option", f"{name}={value}"]
     return shlex.join([*words, *others])
