@@ -64,11 +64,8 @@ class Automatic(CertificateKind):
     sorts_draws: ClassVar[bool] = True  # its draws are tests, and count at any time
 
     resolution: PositiveFloat = RESOLUTION  #: as for the posterior bound
-    #: the number of executions at tasks drawn over the task space, which must be predicted beforehand if the bound is
-    #: from learned dynamics
-    tests: NonNegativeInt = TESTS
-    #: the share of the executions of each task that the bound is about, if they differ by noise
-    quantile: Probability = QUANTILE
+    tests: NonNegativeInt = TESTS  #: executions at drawn tasks; those for learned dynamics must be predicted beforehand
+    quantile: Probability = QUANTILE  #: the share of the executions of each task that a bound with noise is about
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the first certificate that keeps the threshold, or else the one that is nearer to a decision.

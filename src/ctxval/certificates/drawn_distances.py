@@ -19,11 +19,9 @@ class DrawnDistances(ShortRepr):
     """The distances of some tasks on draws of the learned dynamics."""
 
     points: Array  #: tasks, points of the unit cube ``(K, d)``
-    #: distances on S draws ``(S, K)``; infinity if the loop diverges, NaN if no controller can be designed
-    draws: Array
+    draws: Array  #: distances on S draws ``(S, K)``; infinity if a loop diverges, NaN if no controller can be designed
     beyond: Array  #: how far the loop on the mean leaves the records, as a share of the visited range ``(K,)``
-    #: how far it crosses the boundary of the regular part, from -1 to 1; None if there is no boundary
-    crossed: Array | None = None
+    crossed: Array | None = None  #: how far it crosses the boundary of the regular part, from -1 to 1; None without one
 
     @property
     def known(self) -> Mask:

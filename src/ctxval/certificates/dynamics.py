@@ -63,10 +63,8 @@ class Dynamics(CertificateKind):
     needs_model: ClassVar[bool] = True
     takes_suites: ClassVar[bool] = True
 
-    #: the number of executions that must have been predicted beforehand at tasks drawn over the task space
-    tests: NonNegativeInt = TESTS
-    #: the share of the executions of each task that the bound is about, if they differ by noise
-    quantile: Probability = QUANTILE
+    tests: NonNegativeInt = TESTS  #: number of executions that must have been predicted beforehand at drawn tasks
+    quantile: Probability = QUANTILE  #: the share of the executions of each task that a bound with noise is about
 
     def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
         """Refuse a confidence that needs too many draws of the dynamics."""

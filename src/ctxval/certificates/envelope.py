@@ -72,24 +72,18 @@ class Envelope(ShortRepr):
     confidence: float
     statement: str  #: what it says, in one sentence
     share: float = 0.0  #: the share of the tasks that are trusted
-    #: the largest boxes and half-spaces inside it, the largest first; empty for a suite
-    regions: tuple[Region, ...] = ()
-    #: the names of the trusted tasks of a suite; None if the task space is no suite
-    tasks: tuple[str, ...] | None = None
+    regions: tuple[Region, ...] = ()  #: the largest boxes and half-spaces inside it, the largest first; not for a suite
+    tasks: tuple[str, ...] | None = None  #: the names of the trusted tasks of a suite; None if it is no suite
     factor: float | None = None  #: k, by how many spreads the mean must stay below the threshold
-    #: the trial that raised k, by its excess over its prediction or because the draws miss its distance; None if there
-    #: is none
-    raised_by: int | None = None
-    #: the median of what the interpolation adds next to evaluated tasks, as a share of the threshold
-    margin: float = 0.0
+    raised_by: int | None = None  #: the trial that raised k, as predictions or draws miss its distance; else None
+    margin: float = 0.0  #: the median of what the interpolation adds near evaluated tasks, as a share of the threshold
     evaluated: int = 0  #: the number of tasks at which closed loops were run
     checks: int = 0  #: the number of further tasks that checked the interpolation between these
     uncovered: float = 0.0  #: the share of the tasks that are not trusted only because predicted runs leave the records
     #: executions, tests: numbers of executions, and of those that were predicted beforehand at drawn tasks
     executions: int = 0
     tests: int = 0
-    #: the share of the executions of a task whose distances are below tau; None if the system is not noisy
-    quantile: float | None = None
+    quantile: float | None = None  #: the share of the executions of a task that are below tau; None without noise
     assumptions: tuple[str, ...] = ()  #: what it assumes
     #: the number of recorded steps, such as contacts, that are no part of what is learned; a task is not trusted if its
     #: run comes to states like theirs

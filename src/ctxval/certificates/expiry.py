@@ -240,13 +240,10 @@ class WatchState(ShortRepr):
     runs: tuple[str, ...] = ()  #: the names of the later runs
     distances: tuple[float | None, ...] = ()  #: their distances; None if they are unknown
     evidence: float = 0.0  #: the e-detector; the alarm is raised when it reaches ``1 / false_alarms``, and stays
-    #: the run, counted from 1, at which the alarm was raised; None if the certificate still holds
-    alarm: int | None = None
+    alarm: int | None = None  #: the run, counted from 1, at which the alarm was raised; None if there is none
     since: int | None = None  #: the run, counted from 1, from which on the change is likeliest to have acted
     cause: str | None = None  #: the name of the channel with the largest evidence, or ``EXCEEDED``
-    #: how many times as large as those certified its statistics are since that run, or the distance as a multiple of
-    #: the threshold
-    ratio: float | None = None
+    ratio: float | None = None  #: of its statistics since then to those certified, or of the distance to the threshold
 
     def after(self, run: str, statistics: Mapping[str, Statistic], distance: float | None = None) -> Self:
         """Return the state after another run; a channel without a statistic of it says nothing of it."""

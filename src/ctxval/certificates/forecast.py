@@ -20,9 +20,7 @@ _JITTER = 1e-9  # added to variances, relative to the distance's, so that the co
 class Forecast:
     """Forecast of further executions."""
 
-    #: number of executions after which half of the simulated futures are decided, or the fewest that can decide; None
-    #: if it exceeds ``HORIZON``
-    executions: int | None
+    executions: int | None  #: the fewest that can decide, or the median of simulated futures; None above ``HORIZON``
     validated: float  #: share of the futures, or of the posterior samples of the dynamics, that validate the threshold
     falsified: float  #: share of them in which a distance exceeds the threshold
     fewest: bool = False  #: whether ``executions`` is the fewest that can decide

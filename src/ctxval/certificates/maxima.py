@@ -35,8 +35,7 @@ class Maxima(ShortRepr):
     points: Array  #: a maximiser of each draw's path, in the unit cube, shape ``(S, d)``
     conditioned: list[Conditioned]  #: the processes under each draw of the hyperparameters
     owners: Rows  #: index into ``conditioned`` of each draw, shape ``(S,)``
-    #: whether two executions of one task may differ, so that d* is the largest expected distance
-    stochastic: bool = False
+    stochastic: bool = False  #: whether executions of one task may differ, so that d* is the largest expected one
 
     def upper(self, confidence: float) -> float:
         """Return the bound on d* that holds with this probability; a CertificateError if that needs more draws."""

@@ -41,8 +41,7 @@ class CertificateOptions(ShortRepr):
 
     kind: CertificateKind = field(default_factory=Automatic)  #: the kind of certificate, with its own options
     confidence: Confidence = CONFIDENCE  #: confidence level of the certificate, at least 0.5
-    #: the share of the task space that may exceed the threshold, at most 0.5; if it is 0, only bounds on d* validate
-    volume: Volume = 0.0
+    volume: Volume = 0.0  #: share of the tasks that may exceed the threshold; if it is 0, only bounds on d* validate
 
     @classmethod
     def or_automatic(

@@ -35,17 +35,12 @@ class Provenance(ShortRepr):
     """Facts on a campaign, besides its trials, that concern a certificate."""
 
     space: TaskSpace | None = None  #: the task space, to state lengths in its units; None if it is not known
-    #: sentences that a certificate lists among its assumptions, such as what was changed on the system
-    remarks: tuple[str, ...] = ()
-    #: what the experiment's model predicts, for kinds that need it; None if the experiment is not loaded
-    learned: LearnedDistance | None = None
+    remarks: tuple[str, ...] = ()  #: assumptions of certificates, such as what was changed on the system
+    learned: LearnedDistance | None = None  #: what the experiment's model predicts; None if it is not loaded
     distribution: str | None = None  #: the distribution of tasks as a text; None if it is uniform
     units: str = ""  #: the units of the distance
-    #: the largest offset of the start of an execution, as the distance measures it, and as a text; None if executions
-    #: were not recorded
-    start: tuple[float, str] | None = None
-    #: the thresholds in the order in which they were first stated; None if nobody has recorded them
-    thresholds: tuple[StatedThreshold, ...] | None = None
+    start: tuple[float, str] | None = None  #: largest offset of a start, by the distance and as a text; None: unknown
+    thresholds: tuple[StatedThreshold, ...] | None = None  #: in the order of being stated; None if nobody recorded them
     beside: tuple[Neighbour, ...] = ()  #: the other stores of the same experiment beside this one
 
     @classmethod

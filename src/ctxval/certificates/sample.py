@@ -43,10 +43,8 @@ class Sample(ShortRepr):
     #: for each trial, the total number of independent draws that was planned when it was drawn; 0 if they were to end
     #: with the verdict, None if that is not known
     planned: Sequence[int | None] = ()
-    #: failures that are left out, because their tasks were executed with success later
-    made_good: tuple[MadeGood, ...] = ()
-    #: what the experiment's model predicts; None if the experiment is not loaded
-    learned: LearnedDistance | None = None
+    made_good: tuple[MadeGood, ...] = ()  #: left-out failures whose tasks were executed later
+    learned: LearnedDistance | None = None  #: what the experiment's model predicts; None if it is not loaded
     distribution: str | None = None  #: the distribution of tasks as a text; None if it is uniform
     suite: Array | None = None  #: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box
     threshold: float | None = None  #: the threshold that is to be decided; None if there is none

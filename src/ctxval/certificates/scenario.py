@@ -249,8 +249,7 @@ class Region(CertificateKind):
 
     #: how many of the largest excesses are discarded; it must be chosen before the draws are known
     discard: NonNegativeInt = 0
-    #: number M of tasks that are predicted to estimate the share of the tasks that keep the threshold
-    predictions: PositiveInt = 1000
+    predictions: PositiveInt = 1000  #: number M of predicted tasks, to estimate the share that keeps the threshold
 
     @checked
     def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:

@@ -29,10 +29,8 @@ from ctxval.errors import CertificateError
 class StoppingDecision(ShortRepr):
     """Whether a campaign stops, and the next task that the rule asks for."""
 
-    #: whether it stops: the verdict is reached, or will be reached if the open trials show nothing new
-    decided: bool = False
-    #: the point of the unit cube ``(d,)`` to execute next; None if the search chooses the next task
-    next_point: Array | None = None
+    decided: bool = False  #: whether it stops: the verdict is reached, or will be if the open trials show nothing new
+    next_point: Array | None = None  #: the point of the unit cube ``(d,)`` to execute next; None if the search chooses
 
 
 _SCREENINGS = ((8, 0.3), (32, 0.05))

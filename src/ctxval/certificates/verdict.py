@@ -35,12 +35,9 @@ class Verdict:
     reason: str  #: the reason for the answer, in one or two sentences
     witness: Trial | None = None  #: the executed trial with d(p) > tau of a falsification; else None
     certificate: Certificate | None = None  #: the certificate that validates or does not suffice; None if there is none
-    #: a forecast of further executions; None if the answer is decided or nothing can be predicted
-    expected: Forecast | None = None
-    #: the evidence for a validation, its conditions, and what holds without them; else None
-    rests_on: str | None = None
-    #: the parameters of the task to execute next, if learned dynamics choose it to decide; else None
-    next_task: Mapping[str, Any] | None = None
+    expected: Forecast | None = None  #: a forecast of further executions; None if nothing can be predicted
+    rests_on: str | None = None  #: the evidence for a validation, its conditions, and what holds without; else None
+    next_task: Mapping[str, Any] | None = None  #: the task to execute next, if learned dynamics choose it; else None
 
     @property
     def bound(self) -> float | None:
