@@ -82,10 +82,8 @@ class Automatic(CertificateKind):
         if uses_dynamics:
             with suppress(CertificateError):
                 by_dynamics = Dynamics(tests=self.tests, quantile=self.quantile).certify(sample, confidence)
-        if by_dynamics is not None:
-            is_noisy = by_dynamics.details.get("quantile") is not None
-            if is_noisy or _decides(by_dynamics, threshold):
-                return by_dynamics  # the posterior bound of the distance is about systems without noise
+                if by_dynamics.details["quantile"] is not None or _decides(by_dynamics, threshold):
+                    return by_dynamics  # the posterior bound of the distance is about systems without noise
         if sample.suite is not None:
             return by_dynamics or WholeSuite().certify(sample, confidence)
         try:

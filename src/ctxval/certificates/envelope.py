@@ -16,7 +16,7 @@ If a few recorded transitions are no smooth function of what is recorded, as tho
 the draws are learned from the others alone (:mod:`ctxval.learning.regular`), and a task is no part of the envelope if
 its run comes to states like those of the few. The tests are predicted from the executions of all other tasks.
 
-Between these tasks, ``mean + k spread`` is interpolated (:mod:`ctxval.certificates.envelope_surface`). The largest
+Between these tasks, ``mean + k spread`` is interpolated (:mod:`ctxval.certificates.envelope_shape`). The largest
 error of the nearest tasks, if each of them is interpolated from all others, is added. Further tasks of the set check
 this: errors are multiplied until hardly any of these tasks has ``mean + k spread`` above the threshold.
 """
@@ -30,12 +30,12 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, as_floats, require_shape
+from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats, require_shape
 from ctxval._util.boxes import separated_rows
 from ctxval._util.files import write_text
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
-from ctxval.certificates.drawn_distances import FLOOR, LARGEST, DrawnDistances
+from ctxval.certificates.bounds import rank_within
 from ctxval.certificates.dynamics_diagnostics import (
     PREDICTIONS,
     agrees,
@@ -47,19 +47,69 @@ from ctxval.certificates.dynamics_diagnostics import (
     untried_parameter,
 )
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
-from ctxval.certificates.envelope_surface import Surfaces, exported, write_onnx
-from ctxval.certificates.envelope_words import Region, regions_inside
+from ctxval.certificates.envelope_shape import Region, Surfaces, exported, regions_inside, write_onnx
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.sentences.statements import IRREGULAR, dynamics_assumptions, envelope_statement
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TaskSuite
 from ctxval.errors import InputError
 
+FLOOR = 0.005  # least spread, as a share of the threshold
+LARGEST = 2.0  # multiple of the threshold up to which bounds are told apart
 COUNTED = 4096  # tasks of which the share in the envelope is counted
 _EXCEEDED = 1.02  # an executed distance above the threshold counts as at least this multiple of it
 _SAME = 1e-9
 _SAME_TASK = 1e-6
 _WORTH = 0.8  # share of the tasks predicted below the threshold that tests may leave in the envelope
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnDistances(ShortRepr):
+    """The distances of some tasks on draws of the learned dynamics."""
+
+    points: Array  #: tasks, points of the unit cube ``(K, d)``
+    draws: Array  #: distances on S draws ``(S, K)``; infinity if a loop diverges, NaN if no controller can be designed
+    beyond: Array  #: how far the loop on the mean leaves the records, as a share of the visited range ``(K,)``
+    crossed: Array | None = None  #: how far it crosses the boundary of the regular part, from -1 to 1; None without one
+
+    @property
+    def known(self) -> Mask:
+        """Which tasks have a finite distance on each draw, ``(K,)``."""
+        return np.asarray(np.isfinite(self.draws).all(axis=0))
+
+    @property
+    def mean(self) -> Array:
+        """The means over the draws ``(K,)``; infinity if a distance is not known."""
+        return np.where(self.known, np.where(self.known, self.draws, 0.0).mean(axis=0), np.inf)
+
+    def spread(self, threshold: float) -> Array:
+        """Return the standard deviations over the draws ``(K,)``, at least a share of the threshold."""
+        return np.asarray(np.maximum(np.where(self.known, self.draws, 0.0).std(axis=0), FLOOR * threshold))
+
+    def factor(self, threshold: float, confidence: float) -> float:
+        """Return k: the order statistic of the largest standardised excesses of the draws; at least 1."""
+        known, spread = self.known, self.spread(threshold)
+        excess = ((self.draws - self.mean)[:, known] / spread[known]).max(axis=1, initial=0.0)
+        return max(1.0, float(np.sort(excess)[rank_within(confidence, len(excess)) - 1]))
+
+    def and_others(self, others: DrawnDistances) -> DrawnDistances:
+        """Return these tasks together with others on the same draws."""
+        return DrawnDistances(
+            np.concatenate([self.points, others.points]),
+            np.concatenate([self.draws, others.draws], axis=1),
+            np.concatenate([self.beyond, others.beyond]),
+            None if self.crossed is None or others.crossed is None else np.concatenate([self.crossed, others.crossed]),
+        )
+
+    def leaving(self, most: float) -> Array:
+        """Return how far loops leave the records, as a share of ``most``, or cross the boundary ``(K,)``."""
+        # Both have the same slope: smaller slopes cost more of the set, because their errors reach farther.
+        beyond = self.beyond if self.crossed is None else np.maximum(self.beyond, most + self.crossed)
+        return np.asarray(np.minimum(beyond / most, LARGEST))
+
+    def upper(self, factor: float, threshold: float) -> Array:
+        """Return mean + k spread as shares of the threshold ``(K,)``, at most ``LARGEST``."""
+        return np.asarray(np.minimum((self.mean + factor * self.spread(threshold)) / threshold, LARGEST))
 
 
 @dataclass(frozen=True, eq=False)

@@ -144,11 +144,10 @@ def diagnose(
     resolution: float = RESOLUTION,
     covered: Array | None = None,
 ) -> Diagnosis:
-    """Return how well the values agree with the process, and how well the trials cover the tasks.
+    """Return how well the values agree with the processes, and how well the trials cover the tasks.
 
     Args:
-        conditioned: the processes of all draws of the hyperparameters, with the values in the order of the trials.
-        X: the trials' points ``(n, d)``, with ``numbers``; 0, 1, ... by default.
+        X: the trials' points ``(n, d)``, in the order of the values, with ``numbers``; 0, 1, ... by default.
         unordered: which trials have an order without meaning, shape ``(n,)``; none by default.
         resolution: a task that is farther than this from every trial withdraws the bound, in diagonals.
         covered: points that cover tasks, if there are more than X.
@@ -158,21 +157,21 @@ def diagnose(
     if unordered is not None and unordered.any():
         exceed[unordered] = np.mean([_left_out_exceedances(process) for process in conditioned], axis=0)[unordered]
     worst = int(np.nanargmin(exceed))
-    others = "other trials" if unordered is not None and unordered[worst] else "trials before it"
     trial = worst if numbers is None else numbers[worst]
     tested = int(np.isfinite(exceed).sum())
     surprise = float(-np.expm1(tested * np.log1p(-min(exceed[worst], 1 - 1e-16))))
     left_out = float(np.sqrt(np.mean([_left_out(process) for process in conditioned])))
-    covering_points = X if covered is None else covered
-    farthest, d, doubt = farthest_task(covering_points), X.shape[1], None
+    covered = X if covered is None else covered
+    farthest, d, doubt = farthest_task(covered), X.shape[1], None
     if surprise < LEVEL:
+        others = "other trials" if unordered is not None and unordered[worst] else "trials before it"
         deviations = -ndtri(max(exceed[worst], 1e-300))
         doubt = withdrawals.SURPRISING.format(trial=trial, deviations=deviations, others=others)
     elif farthest > resolution:
-        missing = covering(covering_points, resolution, 100)
+        missing = covering(covered, resolution, 100)
         many = "more than 100" if missing is None else f"{len(missing)}"
         doubt = withdrawals.FAR_TASK.format(farthest=farthest, resolution=resolution, many=many)
-    elif bare := len(bare_corners(covering_points, resolution)):
+    elif bare := len(bare_corners(covered, resolution)):
         where = "ends of the task parameter's range" if d == 1 else "corners of the task space"
         doubt = withdrawals.BARE_CORNERS.format(bare=bare, corners=2**d, where=where)
     return Diagnosis(surprise, trial, left_out, farthest, doubt)

@@ -29,10 +29,7 @@ DRAWN: tuple[Origin, ...] = ("iid", "spread")  # origins of tests: independent d
 def share_missed(spread: int, independent: int, dimension: int, confidence: float) -> float:
     """Return the share of tasks that so many tests meet with a probability of at least ``confidence``, at any time.
 
-    Args:
-        spread: the number of points of hypercubes, one after the other, of which only the last may be incomplete.
-        independent: the number of independent draws.
-        dimension: the number of task parameters, which are uniform.
+    The ``spread`` ones are points of hypercubes, one after the other, of which only the last may be incomplete.
     """
     low, high = 0.0, 1.0  # shares of the tasks that are not missed with certainty, and with this probability
     for _ in range(60):

@@ -59,7 +59,6 @@ class Provenance(ShortRepr):
         match description:
             case {"validation": {"model": {"type": "Refined"}}}:
                 remarks.append(withdrawals.REFINED)
-        distribution = described.get(DISTRIBUTION)
         for change in changes:
             if change.what == "accepted":
                 different = "; ".join(change.content.get("differences", [])[:1]) or "nothing that is described"
@@ -70,13 +69,10 @@ class Provenance(ShortRepr):
             elif change.what == "replaced":
                 numbers = ", ".join(change.content.get("before", {}))
                 remarks.append(withdrawals.REPLACED.format(numbers=numbers, why=change.why))
-        return cls(
-            space=_space_of(described),
-            remarks=tuple(remarks),
-            distribution=None if distribution is None else distribution_text(distribution),
-            thresholds=thresholds,
-            beside=tuple(beside),
-        )
+        shares = described.get(DISTRIBUTION)
+        stated = None if shares is None else distribution_text(shares)
+        others = tuple(beside)
+        return cls(_space_of(described), tuple(remarks), None, stated, thresholds=thresholds, beside=others)
 
     def known_before(self, threshold: float, trials: Sequence[Trial]) -> int:
         """Return how many distances were known when a threshold was first stated; 0 if no thresholds were recorded."""

@@ -182,12 +182,8 @@ class Sample(ShortRepr):
     @property
     def failures(self) -> dict[str, list[Any]]:
         """The trials that failed, that could not be measured and that were made good, ready for JSON."""
-        made_good = [asdict(failure) for failure in self.made_good]
-        return {
-            "failed": self.numbers_of("failed"),
-            "unmeasured": self.numbers_of("unmeasured"),
-            "made_good": made_good,
-        }
+        failed, unmeasured = self.numbers_of("failed"), self.numbers_of("unmeasured")
+        return {"failed": failed, "unmeasured": unmeasured, "made_good": [asdict(each) for each in self.made_good]}
 
     @property
     def remarks(self) -> tuple[str, ...]:

@@ -130,13 +130,9 @@ def judge(
     options: CertificateOptions | None = None,
     provenance: Provenance | None = None,
 ) -> Verdict:
-    """Return the verdict by an executed counterexample, or by the certificate that the options ask for.
+    """Return the verdict by an executed counterexample, or by the certificate of the options; by default, of ``auto``.
 
-    Args:
-        trials: all trials of the campaign.
-        threshold: tau, in the distance's units.
-        options: ``auto`` by default. If the theory of the certificate refuses the trials, the verdict is undecided.
-        provenance: what is known besides the trials.
+    All trials of the campaign are given. If the theory of the certificate refuses them, the verdict is undecided.
     """
     known, chosen = provenance or Provenance(), options or CertificateOptions()
     quantile = chosen.kind.quantile

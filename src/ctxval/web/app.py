@@ -91,8 +91,8 @@ class PageRoutes:
     def _inside(self, handler: Handler) -> Callable[[Request], Awaitable[Response]]:
         """Return a handler that is called with the name of the session.
 
-        A browser that needs no token gets a new session. The token of a form cannot be one of that session, so the form
-        is refused with its fields kept: the page was open while the server was started again.
+        A browser that needs no token gets a new session. If the page was open while the server was started again, the
+        token of its form is not one of that session, so the form is refused with its fields kept.
         """
 
         async def handle(request: Request) -> Response:

@@ -102,11 +102,9 @@ def command_of(context: ReportContext, budget: int | None = None, *others: str) 
 
 
 def run_command(settings: Mapping[str, Any], budget: int | None, *others: str, target: str = "") -> str:
-    """Return the command that runs a campaign with settings as a store keeps them.
+    """Return the command that runs a campaign with settings as a store keeps them, and with ``others`` beside them.
 
-    Args:
-        others: options that are not among the settings, with their values.
-        target: the experiment, if it must be named otherwise than in the settings.
+    ``target`` is the experiment, if it must be named otherwise than in the settings.
     """
     file = settings.get("file")
     named = None if file else settings.get("experiment")
