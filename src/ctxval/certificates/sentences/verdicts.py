@@ -182,7 +182,7 @@ def _evidence(certificate: Certificate, tau: float, quantities: Quantities) -> s
     """Return what speaks for a bound on d*: executions, tests of predictions, and what the bound survives."""
     if certificate.volume or certificate.kind == "suite":
         return ""
-    details, text = certificate.details, f"{counted(certificate.trials, 'execution')}"
+    details, text = certificate.details, str(counted(certificate.trials, "execution"))
     best, tests, left = details.get("best"), details.get("tests"), details.get("not_executed")
     if best is not None:
         text += f", the largest distance {quantities.of(f'{best:.4g}')}"

@@ -49,12 +49,10 @@ def distances(context: ReportContext) -> Markup:
             parts.append(paragraph(f"{d - len(axes)} parameters with less influence have no slice here."))
         slices = filter(None, (distance_along(context, axis, small=True) for axis in axes))
         parts += [heading("Slices through the worst task"), small_charts(list(slices))]
-    caption = (
-        "Sensitivity of the distance: the share of each parameter in the variance of the predicted distance, alone and "
-        "together with others (total Sobol index)"
-    )
+    meaning = "the share of each parameter in the variance of the predicted distance, alone and together with others"
     shares = ((context.space.labels[j], float(model.sensitivity[j])) for j in model.influence)
     rows = ((label, percent(share), bar(share)) for label, share in shares)
+    caption = f"Sensitivity of the distance: {meaning} (total Sobol index)"
     sensitivity = table(caption, ("Parameter", "Share", "Bar"), rows)
     return joined([*parts, element("div", sensitivity, predicted, class_="charts"), *_region(context)])
 

@@ -55,15 +55,13 @@ def trials(context: ReportContext) -> Markup:
         head = f"Trial {trial.number}: {quantity(trial.distance, context.labels.units)} at {task_of(context, trial)}"
         drawn.append(details(head, small_charts(_signals(context, trial.number)), opened=trial is worst[0]))
     without = paragraph("No trajectories are recorded, so the worst tasks cannot be drawn.")
-    return joined(
-        [
-            *([paragraph(" ".join(notes))] if notes else []),
-            table(caption, headers, rows, "sortable", id_="trials", label="Table of trials", scroll="scroll tall"),
-            element("div", id="trial", aria_live="polite", class_="needs-script"),
-            element("script", escaped, type="application/json", id="trial-data"),
-            *(drawn if worst else [without]),
-        ]
-    )
+    parts = [paragraph(" ".join(notes))] if notes else []
+    parts += [
+        table(caption, headers, rows, "sortable", id_="trials", label="Table of trials", scroll="scroll tall"),
+        element("div", id="trial", aria_live="polite", class_="needs-script"),
+        element("script", escaped, type="application/json", id="trial-data"),
+    ]
+    return joined([*parts, *(drawn if worst else [without])])
 
 
 def _row(trial: Trial, task: list[float | str], recorded: bool) -> Markup:
