@@ -32,7 +32,7 @@ def drawn_from(points: np.ndarray, draws: int = 40, size: float = 0.05, seed: in
     rng = np.random.default_rng(seed)
     phases, frequencies = rng.uniform(0, 6, (draws, 3)), rng.uniform(1, 4, (draws, 3, 2))
     waves = np.sin(np.einsum("skd,nd->snk", frequencies, points) + phases[:, None]).mean(axis=2)
-    return DrawnDistances(points, points[:, 1] + size * waves, np.zeros(len(points)))
+    return DrawnDistances(points, points[:, 1] + size * waves, *np.zeros((2, len(points))))
 
 
 def evidence_of(**changes: Any) -> DynamicsEvidence:
@@ -218,14 +218,16 @@ def test_of_a_suite_it_is_a_list_and_executed_tasks_are_facts() -> None:
     points = suite.members
     draws = np.tile(points[:, 0], (40, 1)) + 0.01 * np.random.default_rng(0).normal(size=(40, 1))
     executed = [(points[0], 0.7), (points[3], 0.55)]  # nothing is predicted of these
-    found = envelope_of(suite, DrawnDistances(points, draws, np.zeros(5)), evidence_of(), executed, 0.6, 0.95)
+    found = envelope_of(
+        suite, DrawnDistances(points, draws, np.zeros(5), np.zeros(5)), evidence_of(), executed, 0.6, 0.95
+    )
     assert found.tasks == ("b", "c", "d")
     assert found.words == "Trusted: b, c, d."
     assert found.share == pytest.approx(0.6)
     assert found.trusted({"task": "b"})
     assert not found.trusted({"task": "a"})
     assert found.bound({"task": "d"}) == 0.55
-    far = DrawnDistances(points, draws, np.ones(5))
+    far = DrawnDistances(points, draws, np.ones(5), np.zeros(5))
     known = envelope_of(suite, far, evidence_of(), executed, 0.6, 0.95)
     assert known.tasks == ("d",)
     assert known.uncovered == pytest.approx(0.4)  # b and c: a was executed
@@ -236,7 +238,7 @@ def test_of_a_suite_it_is_a_list_and_executed_tasks_are_facts() -> None:
 def test_further_tasks_check_what_is_interpolated() -> None:
     def waves(points: np.ndarray) -> DrawnDistances:
         heights = 0.4 + 0.3 * np.sin(25 * points[:, 0]) * np.sin(25 * points[:, 1])
-        return DrawnDistances(points, np.tile(heights, (40, 1)), np.zeros(len(points)))
+        return DrawnDistances(points, np.tile(heights, (40, 1)), *np.zeros((2, len(points))))
 
     others = np.random.default_rng(8).random((3000, 2))
     false = []
@@ -248,6 +250,14 @@ def test_further_tasks_check_what_is_interpolated() -> None:
         false.append((np.isfinite(known.bound_at(others)) & (waves(others).mean > 0.6)).mean())
     assert false[0] > 0.01
     assert false[1] < 0.5 * false[0]
+
+
+def test_tasks_whose_runs_come_to_places_that_no_execution_entered_are_not_trusted() -> None:
+    drawn = replace(drawn_from(POINTS), away=2 * POINTS[:, 0])  # more than 1 beyond the middle
+    found = envelope_of(SPACE, drawn, evidence_of(), EXECUTED, 0.6, 0.95)
+    low = np.column_stack([np.linspace(0.02, 0.98, 25), np.full(25, 0.1)])
+    assert (np.isfinite(found.bound_at(low)) == (low[:, 0] < 0.5)).mean() > 0.9
+    assert found.uncovered > 0.1
 
 
 def test_tasks_whose_runs_come_to_contacts_are_not_trusted() -> None:

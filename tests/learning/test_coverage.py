@@ -10,8 +10,14 @@ from hypothesis import strategies as st
 from ctxval import Task, TaskSpace, Trajectory, Transitions, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
 from ctxval.core.coverage import StateInputCoverage
-from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.coverage import MOST_COORDINATES, largest_pocket, position_states, untried_corner
+from ctxval.learning.closed_loops import LoopPlanner, Loops
+from ctxval.learning.coverage import (
+    MOST_COORDINATES,
+    away_from_executions,
+    largest_pocket,
+    position_states,
+    untried_corner,
+)
 from ctxval.learning.coverage import coverage as coverage_of
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 
@@ -263,6 +269,20 @@ def test_goals_by_radius_and_angle_are_places_if_labels_of_states_say_so(
     planned = LoopPlanner(validation).plan(points)
     assert position_states(validation.space, labels, planned, points) == expected
     assert position_states(validation.space, labels, planned, points, goals=False) == []
+
+
+def test_loops_are_as_far_from_executions_as_their_farthest_place() -> None:
+    """All places of the pool's loops lie on the line from 0 to 1, of which an execution entered the lower half."""
+    line = np.stack([np.linspace(0, 1, 201), np.zeros(201)], axis=-1)
+    states = np.stack([line[:101:5], line[100:201:5], np.full((21, 2), np.nan)])[None]
+    pool = Loops(np.zeros((1, 1)), line[None, None], np.zeros((1, 1, 200, 1)))
+    loops = Loops(np.zeros((1, 3)), states, np.zeros((1, 3, 20, 1)))
+    executed = [trajectory([0.0, 0.0], [0.5, 0.0])]
+    (away,) = away_from_executions(executed, [[0, 1]], [pool], [loops])
+    np.testing.assert_allclose(away[:2], [0, 0.5], atol=0.07)
+    assert away[2] > 100  # nothing is known of a loop that diverges
+    (none,) = away_from_executions(executed, [], [pool], [loops])
+    np.testing.assert_array_equal(none, 0)
 
 
 def test_two_states_on_one_line_are_no_place() -> None:

@@ -70,6 +70,8 @@ class DrawnDistances(ShortRepr):
     points: Array  #: tasks, points of the unit cube ``(K, d)``
     draws: Array  #: distances on S draws ``(S, K)``; infinity if a loop diverges, NaN if no controller can be designed
     beyond: Array  #: how far the loop on the mean leaves the records, as a share of the visited range ``(K,)``
+    #: how far it comes from places that executions entered ``(K,)``, as a share of what is allowed; 0 without positions
+    away: Array
     crossed: Array | None = None  #: how far it crosses the boundary of the regular part, from -1 to 1; None without one
 
     @property
@@ -98,14 +100,18 @@ class DrawnDistances(ShortRepr):
             np.concatenate([self.points, others.points]),
             np.concatenate([self.draws, others.draws], axis=1),
             np.concatenate([self.beyond, others.beyond]),
+            np.concatenate([self.away, others.away]),
             None if self.crossed is None or others.crossed is None else np.concatenate([self.crossed, others.crossed]),
         )
 
     def leaving(self, most: float) -> Array:
-        """Return how far loops leave the records, as a share of ``most``, or cross the boundary ``(K,)``."""
+        """Return how far loops leave the records and places, or cross the boundary ``(K,)``: above 1, nothing is known.
+
+        Loops may leave the records by ``most``, as a share of the visited range.
+        """
         # Both have the same slope: smaller slopes cost more of the set, because their errors reach farther.
         beyond = self.beyond if self.crossed is None else np.maximum(self.beyond, most + self.crossed)
-        return np.asarray(np.minimum(beyond / most, LARGEST))
+        return np.asarray(np.minimum(np.maximum(beyond / most, self.away), LARGEST))
 
     def upper(self, factor: float, threshold: float) -> Array:
         """Return mean + k spread as shares of the threshold ``(K,)``, at most ``LARGEST``."""

@@ -40,7 +40,7 @@ class StatePocket:
     place: dict[str, float]  #: its centre, by the labels of the states, in their units
     within: dict[str, float]  #: its radius in each of the two states; they are equal if both are places
     #: the task whose predicted run leaves the smallest pockets, and one whose run leads into this one, points of the
-    #: unit cube; empty if the two states are no coordinates of a position that is a task parameter
+    #: unit cube; empty if the two states are no coordinates of a position that tasks choose
     tasks: tuple[tuple[float, ...], ...] = ()
 
 

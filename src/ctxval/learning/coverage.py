@@ -139,12 +139,7 @@ def largest_pocket(
     if not executed or not len(rows):
         return None
     rows = rows[_some(len(rows), 4000)]
-    parts, some = [], visited[rows]
-    for trajectory in executed:  # eight points on the straight line of each step
-        steps = np.arange(len(trajectory.states))
-        fine = np.linspace(0, steps[-1], 8 * int(steps[-1]) + 1)
-        parts.append(np.stack([np.interp(fine, steps, column) for column in trajectory.states.T], axis=-1))
-    entered = np.concatenate(parts)
+    some, entered = visited[rows], _entered(executed)
     widths, couples = np.maximum(high - low, 1e-9), list(combinations(range(len(labels)), 2))
     units = [parted(label)[1] for label in labels]
     places = list(dict.fromkeys(pair for position in positions for pair in combinations(sorted(position), 2)))
@@ -171,6 +166,39 @@ def largest_pocket(
     return StatePocket(
         float(away[at]), dict(zip(names, place, strict=True)), dict(zip(names, within, strict=True)), next_tasks
     )
+
+
+def away_from_executions(
+    executed: Sequence[Trajectory], positions: Sequence[Sequence[int]], of_pool: Sequence[Loops], loops: Sequence[Loops]
+) -> list[Array]:
+    """Return how far closed loops come from all places that executions entered, as a share of the range of the pool's.
+
+    Each array has a number for each task, in the order of the loops.
+
+    Args:
+        positions: of each position, the two states that are its coordinates.
+    """
+    entered = _entered(executed)
+    visited = np.concatenate([each.states[0].reshape(-1, entered.shape[1]) for each in of_pool])
+    widths = np.ptp(np.quantile(visited[np.isfinite(visited).all(axis=1)], _MOSTLY, axis=0), axis=0)
+    away = [np.zeros(each.states.shape[1]) for each in loops]
+    for two in map(list, positions):
+        scale = max(float(widths[two].max()), 1e-9)
+        tree = cKDTree(entered[:, two] / scale)
+        for k, each in enumerate(loops):
+            places = np.nan_to_num(each.states[0][..., two] / scale, nan=_FARTHEST, posinf=_FARTHEST, neginf=-_FARTHEST)
+            away[k] = np.maximum(away[k], tree.query(places)[0].max(axis=1))
+    return away
+
+
+def _entered(executed: Sequence[Trajectory]) -> Array:
+    """Return states that executions entered ``(N, n)``, eight on the straight line of each step."""
+    parts = []
+    for trajectory in executed:
+        steps = np.arange(len(trajectory.states))
+        fine = np.linspace(0, steps[-1], 8 * int(steps[-1]) + 1)
+        parts.append(np.stack([np.interp(fine, steps, column) for column in trajectory.states.T], axis=-1))
+    return np.concatenate(parts)
 
 
 def position_states(

@@ -15,7 +15,7 @@ from ctxval.core.coverage import StateInputCoverage, StatePocket
 from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import AnyDraws, distances_of, loop_pairs
-from ctxval.learning.coverage import beyond_records, coverage, largest_pocket, position_states
+from ctxval.learning.coverage import away_from_executions, beyond_records, coverage, largest_pocket, position_states
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import SETTLED, NoisyDraws, NoisyPosterior
@@ -117,13 +117,17 @@ class LearnedDynamics(ShortRepr):
         parts = None if self.split is None else self.split.posterior(rows)
         return None if parts is None else replace(self, posterior=parts[0], boundary=parts[1]).with_noisy(None)
 
-    def drawn_distances(self, points: Array, draws: int, *, settled: bool = True) -> tuple[Array, Array, Array | None]:
+    def drawn_distances(
+        self, points: Array, draws: int, *, settled: bool = True
+    ) -> tuple[Array, Array, Array, Array | None]:
         """Return the distances ``(S, m)`` of tasks ``(m, d)`` on draws, and how far their loops leave the records.
 
         The latter is the largest excess ``(m,)`` of the loop on the mean over the records in a coordinate, as a share
         of the range of the loops of the pool; it is infinity if a task cannot be planned. The draws, at least so many,
         are the same for all points; if the system is noisy and not ``settled``, they have fewer sequences of noise.
-        If only regular transitions are learned from, the third array says how far loops cross their boundary ``(m,)``.
+        The third array is the largest distance of the loop from places that executions entered ``(m,)``, as a share of
+        their range; 0 if tasks choose no positions. If only regular transitions are learned from, the fourth array says
+        how far loops cross their boundary ``(m,)``.
         """
         search, planner = self.study.search, self.study.planner
         with single_threaded():
@@ -140,17 +144,18 @@ class LearnedDynamics(ShortRepr):
                 self._draws[key] = drawn
             values = planner.distances(self._draws[key], planned, len(points))
             of_pool, loops = (planner.run(self.drawn_from.silent, plans) for plans in (search.plans, planned))
-            beyond = np.full(len(points), np.inf)
+            beyond, away = np.full(len(points), np.inf), np.zeros(len(points))
             executed_only = self.boundary is not None
             all_beyond = beyond_records(self.posterior, of_pool, loops, executed_only=executed_only)
-            for plan, each in zip(planned, all_beyond, strict=True):
-                beyond[plan.rows] = each
+            all_away = away_from_executions(self.trajectories_of_system, self.positions, of_pool, loops)
+            for plan, *each in zip(planned, all_beyond, all_away, strict=True):
+                beyond[plan.rows], away[plan.rows] = each
             if self.boundary is None:
-                return values, beyond, None
+                return values, beyond, away, None
             crossed = np.ones(len(points))
             for plan, loop in zip(planned, loops, strict=True):
                 crossed[plan.rows] = self.boundary.crossed(self.posterior, loop)
-        return values, beyond, crossed
+        return values, beyond, away, crossed
 
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""
@@ -187,6 +192,14 @@ class LearnedDynamics(ShortRepr):
         )
 
     @functools.cached_property
+    def positions(self) -> list[list[int]]:
+        """Of each position that tasks choose, the two states that are its coordinates; a suite has no other tasks."""
+        study, search = self.study, self.study.search
+        space, goals = study.validation.space, study.given.outputs is None
+        labels = self.labels[: len(self.posterior.data.sizes)]
+        return position_states(space, labels, search.plans, search.pool, goals=goals) if space.members is None else []
+
+    @functools.cached_property
     def pocket(self) -> StatePocket | None:
         """The largest region of two states that loops enter and no execution has entered."""
         planner, states, pool = self.study.planner, len(self.posterior.data.sizes), self.study.search.pool[:256]
@@ -199,11 +212,8 @@ class LearnedDynamics(ShortRepr):
             for plan, each in zip(planned, loops, strict=True)
         ]
         rows, finite = np.concatenate([each.ravel() for each in of_task]), np.isfinite(visited).all(axis=1)
-        space, labels = self.study.validation.space, self.labels[:states]
-        goals = self.study.given.outputs is None
-        # A suite has no other tasks.
-        positions = position_states(space, labels, planned, pool, goals=goals) if space.members is None else []
-        return largest_pocket(visited[finite], self.trajectories_of_system, labels, positions, rows[finite], pool)
+        executed, labels = self.trajectories_of_system, self.labels[:states]
+        return largest_pocket(visited[finite], executed, labels, self.positions, rows[finite], pool)
 
     @property
     def untried_parameter(self) -> tuple[int, float, Array] | None:
