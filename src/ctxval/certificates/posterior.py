@@ -27,13 +27,7 @@ from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, far
 from ctxval.certificates.forecast import forecast
 from ctxval.certificates.maxima import MOST, Maxima, draw_maxima, representative, settle_maxima
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.sentences import withdrawals
-from ctxval.certificates.sentences.statements import (
-    ONE_CAMPAIGN,
-    both_outcomes,
-    posterior_assumptions,
-    posterior_statement,
-)
+from ctxval.certificates.sentences import statements, withdrawals
 from ctxval.errors import CertificateError, InputError
 from ctxval.gp.acquisition import UpperConfidenceBound, maximise
 from ctxval.gp.hyperposterior import Conditioned
@@ -81,7 +75,7 @@ class Posterior(CertificateKind):
         )
         hyperparameters = [process.hyperparameters for process in processes]
         rough, d = float(np.mean([each.nu == 1.5 for each in hyperparameters])), sample.points.shape[1]
-        assumed = posterior_assumptions(sample, len(used), resolution, stochastic=stochastic)
+        assumed = statements.posterior_assumptions(sample, len(used), resolution, stochastic=stochastic)
         details = {
             "best": sample.best,
             "gap": upper - sample.best,
@@ -100,9 +94,9 @@ class Posterior(CertificateKind):
             "diagnosis": {name: value for name, value in vars(diagnosis).items() if name != "doubt"},
             "failures": sample.failures,
         }
-        statement = posterior_statement(upper, error, confidence, stochastic=stochastic)
-        doubt = both_outcomes(sample, stochastic=stochastic) or diagnosis.doubt
-        assumptions, n = (*assumed, *sample.remarks, ONE_CAMPAIGN), len(sample)
+        statement = statements.posterior_statement(upper, error, confidence, stochastic=stochastic)
+        doubt = statements.both_outcomes(sample, stochastic=stochastic) or diagnosis.doubt
+        assumptions, n = (*assumed, *sample.remarks, statements.ONE_CAMPAIGN), len(sample)
         return Certificate(self.name, statement, upper, confidence, 0.0, n, assumptions, details, doubt, error)
 
 
