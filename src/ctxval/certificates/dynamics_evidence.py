@@ -60,10 +60,8 @@ class CheckedPrediction(ShortRepr):
     def to_json(self) -> dict[str, Any]:
         """Return all attributes but the quantiles, ready for JSON: numbers that are not finite are None."""
         plain = {name: value for name, value in asdict(self).items() if name not in ("quantiles", "runs")}
-        return {
-            name: None if isinstance(value, float) and not np.isfinite(value) else value
-            for name, value in plain.items()
-        }
+        unknown = [name for name, value in plain.items() if isinstance(value, float) and not np.isfinite(value)]
+        return {**plain, **dict.fromkeys(unknown)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +223,10 @@ class LearnedDistance(Protocol):
         """Return distances ``(m,)``, or NaN, at points ``(m, d)`` of the unit cube, predicted from earlier trials."""
 
     def dynamics(self, confidence: float, quantile: float = QUANTILE) -> DynamicsEvidence | None:
-        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned."""
+        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned.
+
+        The confidence sets the least number of posterior samples. Users' code raises a CertificateError.
+        """
 
     def tasks(self, count: int, seed: int) -> Array:
         """Return draws from the distribution of tasks, independent of trials: points ``(count, d)``."""

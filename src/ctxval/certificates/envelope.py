@@ -150,7 +150,10 @@ class Envelope(ShortRepr):
     _bounds: Array | None = None
 
     def trusted(self, task: Mapping[str, Any] | ArrayLike) -> Any:
-        """Return whether tasks are trusted: of a mapping by name a bool, of points ``(..., d)`` a mask ``(...)``."""
+        """Return whether tasks are trusted: of a mapping by name a bool, of points ``(..., d)`` of the space ``(...)``.
+
+        Tasks outside of the task space are not trusted.
+        """
         return np.isfinite(self.bound(task))
 
     def bound(self, task: Mapping[str, Any] | ArrayLike) -> Any:

@@ -101,7 +101,10 @@ class Posterior(CertificateKind):
 
 
 def instantaneous_bound(sample: Sample) -> dict[str, float] | None:
-    """Return the largest UCB of the paper's GP, and its gap to the best distance; None if fewer than two are known."""
+    """Return the largest UCB of the paper's GP with estimated hyperparameters, and its gap to the best distance found.
+
+    It is below d* about as often as above. It is None if fewer than two distances are known.
+    """
     try:
         surrogate = fit_surrogate(sample.points, sample.distances)
     except InputError:

@@ -167,7 +167,7 @@ class Sample(ShortRepr):
         return [number for number, each in zip(self.numbers, self.states, strict=True) if each == state]
 
     def differing(self, tolerance: float) -> tuple[int, int] | None:
-        """Return the rows of the first execution of a task and of the one that differs most, by a tolerance."""
+        """Return the rows of the first execution of a task and of the one most unlike it, beyond a tolerance."""
         _, firsts, tasks = np.unique(self.points, axis=0, return_index=True, return_inverse=True)
         first_of = firsts[tasks.ravel()]
         differences = np.nan_to_num(np.abs(self.distances - self.distances[first_of]), nan=0.0, posinf=0.0)
@@ -232,7 +232,7 @@ def advice_to_remeasure(sample: Sample) -> str:
 
 
 def without_success(trials: Sequence[Trial]) -> list[Trial]:
-    """Return the trials without a distance whose task was not executed later; other failures may have been faults."""
+    """Return the trials without a distance whose task was not executed with success later."""
     unknown = (trial for trial in trials if trial.distance is None and trial.state != "open")
     return [each for each in unknown if all(other.number < each.number for other in executions_of(each, trials))]
 

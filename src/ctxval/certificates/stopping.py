@@ -8,6 +8,7 @@ wrong.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,10 +82,9 @@ class StoppingRule(ShortRepr):
         points = np.array([trial.unit_point for trial in trials])
         if not trials or covering(points, self.resolution, 0) is None:
             return False
-        try:
+        with suppress(CertificateError):
             return self._is_kept(_ended(trials))[1]
-        except CertificateError:
-            return False
+        return False
 
     def _is_kept(self, sample: Sample) -> tuple[Maxima, bool]:
         drawn = settle_maxima(sample, self.threshold, self.confidence)

@@ -182,7 +182,11 @@ def to_json(context: ReportContext) -> dict[str, Any]:
 
 
 def junit(context: ReportContext) -> str:
-    """Return the verdict and the diagnostics as JUnit XML, one test for each; it is skipped if it is not known."""
+    """Return the verdict and the diagnostics as JUnit XML: one test for each.
+
+    The verdict fails if M is falsified, and is skipped if it is undecided. A diagnostic fails if it speaks against the
+    verdict, and is skipped if it is not known.
+    """
 
     def xml_text(words: str) -> str:  # control characters are written out
         return shortened(visible(words).replace("\ufffe", "").replace("\uffff", ""))

@@ -69,7 +69,7 @@ class Innermost:
 
 
 class PageState:
-    """What the page shows, for any number of browsers; it belongs to the event loop, and so reads no store."""
+    """What the page shows; it belongs to the event loop, so only what never changes of a campaign is read here."""
 
     live = False  # whether a command executes the tasks, so that the page only shows them
     choosing: Work | None = None

@@ -187,13 +187,12 @@ def appendix(context: ReportContext) -> Iterator[Entry]:
     space, units, certificate, digests = context.space, context.labels.units, context.certificate, identity(context)
     synthesizer = None if context.validation is None else type(context.validation.synthesizer).__name__
     design = "" if synthesizer is None else f", with the synthesizer {synthesizer}"
-    yield Entry(
-        "Intended use",
-        f"{_NASA}, {_V10}",
+    use = (
         f"The model predicts closed loops under controllers that are designed on it{design}, for the tasks of "
         f"{context.name or 'this experiment'}: {_box(context, space.low, space.high)}. Distribution of tasks: "
-        f"{context.provenance.distribution or 'uniform'}.",
+        f"{context.provenance.distribution or 'uniform'}."
     )
+    yield Entry("Intended use", f"{_NASA}, {_V10}", use)
     described = context.parts.get("distance")
     kind = described.get("type", "a function") if isinstance(described, dict) else described or "not known"
     yield Entry(
@@ -209,13 +208,12 @@ def appendix(context: ReportContext) -> Iterator[Entry]:
     yield Entry("Acceptance criterion (accuracy requirement)", f"{_NASA}, {_V10}", criterion)
     origins = Counter(trial.origin for trial in context.trials)
     listed = ", ".join(f"{count} {origin}" for origin, count in sorted(origins.items()))
-    yield Entry(
-        "Referent data",
-        f"{_NASA}, {_V10}",
+    referent = (
         f"{context.executions} executions of the system in {len(context.trials)} trials ({listed or 'none'}), of which "
         f"{len(context.completed)} gave a distance and {len(context.recordings)} a recorded trajectory. Digest of the "
-        f"description of the system: {digests.get('digest of the system', 'not known')}.",
+        f"description of the system: {digests.get('digest of the system', 'not known')}."
     )
+    yield Entry("Referent data", f"{_NASA}, {_V10}", referent)
     error, executed = "No distance is known.", "Nothing was executed."
     if context.completed:
         worst = context.worst_first[0]
@@ -254,19 +252,13 @@ def appendix(context: ReportContext) -> Iterator[Entry]:
     yield Entry("Results robustness (sensitivity)", _NASA, robustness)
     yield Entry("Assumptions", f"{_NASA}, {_V10}", f"{assumptions}.")
     yield Entry("Limits of the assessment: what was not tested", f"{_NASA}, {_V10}", " ".join(context.not_tested))
-    yield Entry(
-        "Verification",
-        f"{_NASA}, {_V10}",
-        "Software and solution verification of the model itself are not part of this campaign. Diagnostics of the "
-        f"campaign: {lights or 'nothing is unusual'}.",
-    )
+    verification = "Software and solution verification of the model itself are not part of this campaign."
+    found = f"Diagnostics of the campaign: {lights or 'nothing is unusual'}."
+    yield Entry("Verification", f"{_NASA}, {_V10}", f"{verification} {found}")
     yield Entry("Changes during the campaign", _NASA, changes or "None is recorded.")
-    yield Entry(
-        "Provenance",
-        _NASA,
-        f"Store {context.store.name}; ctxval {VERSION}; command: {command_of(context) or 'none'}; digest of the "
-        f"description of the model: {digests.get('digest of the model', 'not known')}.",
-    )
+    described_as = f"digest of the description of the model: {digests.get('digest of the model', 'not known')}"
+    command = f"command: {command_of(context) or 'none'}"
+    yield Entry("Provenance", _NASA, f"Store {context.store.name}; ctxval {VERSION}; {command}; {described_as}.")
     conclusion = str(context.verdict or "No verdict, because no threshold was stated.")
     yield Entry("Conclusion", f"{_NASA}, {_V10}", conclusion)
 
