@@ -105,10 +105,7 @@ class DrawnDistances(ShortRepr):
         )
 
     def leaving(self, most: float) -> Array:
-        """Return how far loops leave the records and places, or cross the boundary ``(K,)``: above 1, nothing is known.
-
-        Loops may leave the records by ``most``, as a share of the visited range.
-        """
+        """Return how far loops leave records and places, or cross the boundary ``(K,)``; nothing is known above 1."""
         # Both have the same slope: smaller slopes cost more of the set, because their errors reach farther.
         beyond = self.beyond if self.crossed is None else np.maximum(self.beyond, most + self.crossed)
         return np.asarray(np.minimum(np.maximum(beyond / most, self.away), LARGEST))
@@ -266,8 +263,7 @@ def _raised(
 ) -> tuple[float, int | None]:
     """Return k, and the trial that raised it; None if it is that of the draws.
 
-    The draws hardly miss any task that they were learned from if the next state is a function of what is recorded.
-    Stiff contacts and hidden states are missed in both directions, so a distance that is too small counts as well.
+    Contacts and hidden states are missed in both directions, so a distance that is too small counts as well.
     """
     factor, rises = drawn.factor(threshold, confidence), rises_of(evidence, threshold)
     if evidence.quantile is None:  # else noise explains the differences
@@ -342,7 +338,6 @@ def envelope_of(
         executed: points of the unit cube ``(d,)`` with their distances.
         evaluate: returns the distances of further tasks on the same draws; None if the interpolation is not checked.
         checks: the number of these tasks.
-        units: the units of the distance.
         irregular: the number of recorded steps that the draws are not learned from.
     """
     factor, raised_by = _raised(drawn, evidence, threshold, confidence)
