@@ -41,7 +41,6 @@ class Snapshot:
 
     @property
     def waiting(self) -> list[Trial]:
-        """The open trials, which people execute, or which a program is executing."""
         return [trial for trial in self.trials if trial.state == "open"]
 
     @property

@@ -125,7 +125,6 @@ class Waiting:
         self._ends: dict[Connection, asyncio.TimerHandle] = {}
 
     def add(self, connection: Connection) -> None:
-        """Let a connection wait, from now on."""
         self.remove(connection)
         self._ends[connection] = connection.loop.call_later(10.0, connection.transport.abort)
         if len(self._ends) > 128:

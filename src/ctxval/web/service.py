@@ -101,7 +101,6 @@ class CampaignService(PageState):
             return self.snapshot.trials[number]
 
     async def files_of(self, number: int) -> Files:
-        """Return the files of an open trial, after they are prepared."""
         if number in self._preparing:
             await asyncio.shield(self._preparing[number])
         files = self.files.get(number)

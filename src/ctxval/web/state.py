@@ -41,7 +41,6 @@ class Work:
         return replace(self, progress=progress, reached=self.reached if same else time.monotonic())
 
     def to_json(self) -> dict[str, Any]:
-        """Return the stage in words, how much of it is done, and the whole seconds since the start."""
         now, progress = time.monotonic(), self.progress
         counted = amount(progress, now - self.reached)
         text = f"{progress.stage}, {counted}" if counted else progress.stage
