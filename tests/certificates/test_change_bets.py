@@ -7,7 +7,7 @@ import pytest
 from scipy.special import logsumexp
 
 from ctxval._util.arrays import Array
-from ctxval.certificates.change_bets import SCALES, KnownStatistics, ScaleBets, SlopeBets
+from ctxval.certificates.expiry import SCALES, KnownStatistics, ScaleBets, SlopeBets
 
 
 def known(values: Array, freedom: float | None) -> KnownStatistics:

@@ -9,7 +9,7 @@ import pytest
 from rig_pages import pendulum, plane
 
 from ctxval.certificates.envelope import Envelope, withdrawn
-from ctxval.certificates.envelope_surface import Surfaces
+from ctxval.certificates.envelope_shape import Surfaces
 from ctxval.report import ReportContext, context_of_campaign
 from ctxval.report.sections.distances import envelope
 

@@ -16,7 +16,6 @@ from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates.automatic import Automatic
-from ctxval.certificates.drawn_distances import DrawnDistances
 from ctxval.certificates.dynamics import Dynamics, draws_for
 from ctxval.certificates.dynamics_diagnostics import (
     NOISE,
@@ -29,6 +28,7 @@ from ctxval.certificates.dynamics_diagnostics import (
 )
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.envelope import (
+    DrawnDistances,
     Envelope,
     boundary_tasks,
     doubt_of_envelope,

@@ -22,7 +22,7 @@ from ctxval.campaign.proposals import Steadiness, spread_tests
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule, Verdict
 from ctxval.certificates.anytime import AnytimeAudit
-from ctxval.certificates.automatic import Automatic
+from ctxval.certificates.automatic import Automatic, WholeSuite
 from ctxval.certificates.bets import bets_against
 from ctxval.certificates.bounds import Quantities, with_units
 from ctxval.certificates.covering import RESOLUTION, covering
@@ -46,7 +46,6 @@ from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, MANY, TESTS
 from ctxval.certificates.sample import SAME
-from ctxval.certificates.suite import WholeSuite
 from ctxval.certificates.verdict import counterexample, require_suite
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError

@@ -1,41 +1,21 @@
 """Certificates: statements about d* with their assumptions, and the verdicts that rest on them."""
 
 from ctxval.certificates.anytime import AnytimeAudit
-from ctxval.certificates.automatic import Automatic
+from ctxval.certificates.automatic import Automatic, WholeSuite
 from ctxval.certificates.base import KINDS, Certificate, CertificateKind, require_use
 from ctxval.certificates.convergence import is_validated, rate
-from ctxval.certificates.covering import (
-    RESOLUTION,
-    bare_corners,
-    covering,
-    farthest_task,
-    most_contested,
-)
+from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, farthest_task, most_contested
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
-from ctxval.certificates.dynamics_evidence import (
-    CheckedPrediction,
-    DynamicsEvidence,
-    LearnedDistance,
-    UntriedParameter,
-)
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, LearnedDistance, UntriedParameter
 from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.posterior import Diagnosis, Posterior, diagnose, instantaneous_bound
 from ctxval.certificates.provenance import Neighbour, Provenance
-from ctxval.certificates.region import Region
 from ctxval.certificates.sample import PLANNED, MadeGood, Sample, require_learned
-from ctxval.certificates.scenario import (
-    Audit,
-    SamplingDiscarding,
-    Scenario,
-    samples_needed,
-    tail,
-    volume_bound,
-)
+from ctxval.certificates.scenario import Audit, Region, SamplingDiscarding, Scenario, samples_needed, tail, volume_bound
 from ctxval.certificates.stopping import StoppingDecision, StoppingRule
-from ctxval.certificates.suite import WholeSuite
 from ctxval.certificates.verdict import Assessment, Verdict, assess, judge, judge_by
 from ctxval.core.coverage import StateInputCoverage, StateInputGap, UntriedCorner
 

@@ -1,18 +1,11 @@
 r"""An anytime audit: independent draws bound the volume above a threshold, valid at any stopping time.
 
-Let p be the share of tasks above the threshold, and let the hypothesis be p >= eps. After n independent draws with k
-violations, and for q <= eps,
+Let k of n independent draws exceed the threshold. Against the hypothesis that at least a share eps of the tasks does,
 
-    L_n(q) = (q / eps)^k ((1 - q) / (1 - eps))^(n - k)
+    E_n(eps) = w 1{k = 0} (1 - eps)^(-n) + (1 - w) B(k+1, n-k+1) I_eps(k+1, n-k+1) / (eps^(k+1) (1 - eps)^(n-k))
 
-is a supermartingale under the hypothesis: one draw multiplies its expectation by the factor
-p q / eps + (1 - p)(1 - q) / (1 - eps), which decreases with p and is 1 at p = eps. The mixture of q = 0 and of a
-uniform q in [0, eps],
-
-    E_n(eps) = w 1{k = 0} (1 - eps)^(-n) + (1 - w) B(k+1, n-k+1) I_eps(k+1, n-k+1) / (eps^(k+1) (1 - eps)^(n-k)),
-
-is a supermartingale too. Ville's inequality gives Pr(sup_n E_n(p) >= 1 / beta) <= beta, whenever the audit stops and
-whatever was looked at. Test martingales: Shafer et al. 2011; mixtures for bounded means: Waudby-Smith and Ramdas 2024.
+is a supermartingale: the mixture, over q = 0 and a uniform q in [0, eps], of likelihood ratios of the shares q and eps.
+Ville's inequality gives Pr(sup_n E_n(p) >= 1 / beta) <= beta for the true share p (docs/theory.md).
 """
 
 from __future__ import annotations
@@ -48,53 +41,37 @@ class AnytimeAudit(CertificateKind):
 
     @checked
     def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
-        """Bound the volume above the threshold of the sample, which was fixed before the draws were known.
-
-        A draw without a distance violates it.
-        """
+        """Bound the volume above the threshold, which was fixed before the draws; failed draws violate it."""
         if sample.threshold is None:
             what = "an anytime audit bounds the volume above a threshold"
             raise CertificateError(f"{what}, so it needs one (--threshold).")
-        threshold = float(sample.threshold)
-        drawn = sample.only("iid")
-        if not len(drawn):
+        threshold, drawn = float(sample.threshold), sample.only("iid")
+        n, limit = len(drawn), f"{threshold:.6g}"
+        if not n:
             raise CertificateError(
                 "an anytime audit needs independent draws of tasks, and there is none; use --audit N."
             )
         violating = ~(drawn.distances <= threshold)  # also where no distance is known
         volume = anytime_volume(violating, 1 - confidence)
+        remark = " or fail, however often this was looked at and continued"
+        statement = share_above(sample, volume, confidence, limit, n, remark)
+        audited = f"the audited tasks are independent and {distributed(sample)}"
+        fixed = f"the threshold {limit} was fixed before any of them was known"
+        assumptions = (audited, fixed, *ABOUT_DRAWS, *sample.remarks, ONE_CAMPAIGN)
+        details = {
+            "violations": int(violating.sum()),
+            "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
+            "failed": drawn.failed,
+            "failures": sample.failures,
+        }
         return Certificate(
-            kind=self.name,
-            statement=share_above(
-                *(sample, volume, confidence, f"{threshold:.6g}", len(drawn)),
-                " or fail, however often this was looked at and continued",
-            ),
-            upper_bound=threshold,
-            confidence=confidence,
-            volume=volume,
-            trials=len(drawn),
-            assumptions=(
-                f"the audited tasks are independent and {distributed(sample)}",
-                f"the threshold {threshold:.6g} was fixed before any of them was known",
-                *ABOUT_DRAWS,
-                *sample.remarks,
-                ONE_CAMPAIGN,
-            ),
-            details={
-                "violations": int(violating.sum()),
-                "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
-                "failed": drawn.failed,
-                "failures": sample.failures,
-            },
+            *(self.name, statement, threshold, confidence, volume, n, assumptions, details),
             distribution=sample.distribution,
         )
 
 
 def anytime_volume(violating: Mask, beta: float) -> float:
-    """Return the least volume that draws ``(n,)`` reject at one of the times that there were, 1 if they reject none.
-
-    The true volume is rejected at any time with probability at most beta.
-    """
+    """Return the least volume that draws ``(n,)`` reject at one of the times that there were, 1 if they reject none."""
 
     def excess(volume: float, n: int, violations: int) -> float:
         return float(log_e_value(n, violations, np.array(volume)) + np.log(beta))

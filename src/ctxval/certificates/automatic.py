@@ -10,6 +10,7 @@ import numpy as np
 
 from ctxval._util.checked import NonNegativeInt, PositiveFloat, Probability
 from ctxval._util.registry import part
+from ctxval._util.representation import counted
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics import Dynamics
@@ -17,10 +18,34 @@ from ctxval.certificates.dynamics_diagnostics import FEWEST
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample
+from ctxval.certificates.sentences.statements import EXECUTED_AGAIN
 from ctxval.certificates.sentences.verdicts import supported as supported_by
-from ctxval.certificates.suite import WholeSuite
 from ctxval.core.quantiles import QUANTILE
 from ctxval.errors import CertificateError
+
+
+@part("suite")
+@dataclass(frozen=True, repr=False)
+class WholeSuite(CertificateKind):
+    """The largest distance of a suite of tasks, all of which were executed."""
+
+    name: ClassVar[str] = "suite"
+    takes_suites: ClassVar[bool] = True
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return the certificate; the largest executed distance is the largest of all."""
+        missing = sample.not_executed
+        if missing is None:
+            raise CertificateError("tasks fill a box here, so they cannot all be executed; this kind is for a suite.")
+        if missing:
+            raise CertificateError(
+                f"{missing} of {counted(sample.tasks or 0, 'task')} of the suite have no distance yet, so the largest "
+                "one is not known; `ctxval run` executes them."
+            )
+        h, assumptions = sample.best, (EXECUTED_AGAIN, *sample.remarks)
+        statement = f"All {sample.tasks} tasks of the suite were executed, and their largest distance is {h:.6g}."
+        details = {"best": h, "tasks": sample.tasks, "failures": sample.failures}
+        return Certificate(self.name, statement, h, confidence, 0.0, len(sample), assumptions, details)
 
 
 @part("auto")
@@ -39,11 +64,8 @@ class Automatic(CertificateKind):
     sorts_draws: ClassVar[bool] = True  # its draws are tests, and count at any time
 
     resolution: PositiveFloat = RESOLUTION  #: as for the posterior bound
-    #: the number of executions at tasks drawn over the task space, which must be predicted beforehand if the bound is
-    #: from learned dynamics
-    tests: NonNegativeInt = TESTS
-    #: the share of the executions of each task that the bound is about, if they differ by noise
-    quantile: Probability = QUANTILE
+    tests: NonNegativeInt = TESTS  #: executions at drawn tasks; those for learned dynamics must be predicted beforehand
+    quantile: Probability = QUANTILE  #: the share of the executions of each task that a bound with noise is about
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the first certificate that keeps the threshold, or else the one that is nearer to a decision.
@@ -60,10 +82,8 @@ class Automatic(CertificateKind):
         if uses_dynamics:
             with suppress(CertificateError):
                 by_dynamics = Dynamics(tests=self.tests, quantile=self.quantile).certify(sample, confidence)
-        if by_dynamics is not None:
-            is_noisy = by_dynamics.details.get("quantile") is not None
-            if is_noisy or _decides(by_dynamics, threshold):
-                return by_dynamics  # the posterior bound of the distance is about systems without noise
+                if by_dynamics.details["quantile"] is not None or _decides(by_dynamics, threshold):
+                    return by_dynamics  # the posterior bound of the distance is about systems without noise
         if sample.suite is not None:
             return by_dynamics or WholeSuite().certify(sample, confidence)
         try:

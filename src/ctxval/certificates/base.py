@@ -35,15 +35,11 @@ class Certificate:
     trials: int  #: the number n of trials that it is computed from
     assumptions: tuple[str, ...]  #: conditions under which the statement holds, one sentence each
     details: dict[str, Any] = field(default_factory=dict)  #: the numbers from which the statement is computed
-    #: why the certificate is withdrawn, so that its statement must not be used; None if it is not
-    doubt: str | None = None
-    #: standard error of ``upper_bound`` in the distance's units, if it is computed from random draws; else 0
-    error: float = 0.0
+    doubt: str | None = None  #: why it is withdrawn, so that its statement must not be used; None if it is not
+    error: float = 0.0  #: standard error of ``upper_bound`` if it is computed from random draws; else 0
     version: str = VERSION  #: the version of ctxval that computed it
-    #: the distribution of tasks as a text, which ``volume`` is a share of; None if it is uniform
-    distribution: str | None = None
-    #: a forecast of further executions, for the threshold of its sample; None if it decides, or can predict nothing
-    expected: Forecast | None = None
+    distribution: str | None = None  #: the distribution of tasks as a text, which ``volume`` is of; None if uniform
+    expected: Forecast | None = None  #: a forecast of further executions; None if it decides, or can predict nothing
 
     @property
     def bound(self) -> float | None:

@@ -4,12 +4,9 @@ With the information gain gamma_n of the kernel, and |P| the dimension of the ta
 
     Pr(d* > best_n + r_n for some n) < eps,   r_n = C sqrt(|P| gamma_n / n).
 
-The paper prints "for all n", from which its corollary would not follow; its proof gives "for some n". It does not give
-C, and no trials determine C, so no verdict rests on this bound.
-
-For a Matern kernel of smoothness nu, gamma_n = O(n^(e) log n) with e = |P|(|P|+1) / (2 nu + |P|(|P|+1)); without the
-logarithm, nu = 3/2 gives the printed r_n = C sqrt(|P| / n^(3 / (3 + |P|(|P|+1)))). For the squared exponential,
-gamma_n = O((log n)^(|P|+1)).
+The paper does not give C, and no trials determine it, so no verdict rests on this bound (docs/theory.md). For a Matern
+kernel of smoothness nu, gamma_n is n^(e) with e = |P|(|P|+1) / (2 nu + |P|(|P|+1)), up to a logarithm; for the squared
+exponential, it is (log n)^(|P|+1).
 """
 
 from __future__ import annotations
@@ -41,8 +38,5 @@ def is_validated(
     dimension: PositiveInt,
     kernel: KernelName = "matern-3/2",
 ) -> bool:
-    """Return whether Corollary 1 validates the model: ``best_n < tau - r_n``.
-
-    n tasks were chosen by the acquisition function. The largest distance found, tau and the constant C have one unit.
-    """
+    """Return whether Corollary 1 validates the model after n tasks of GP-UCB: ``best_n < tau - r_n``."""
     return best < threshold - constant * rate(n, dimension, kernel)

@@ -1,26 +1,19 @@
 r"""The sign of an expected difference of two distances, by a test that may stop at any time.
 
-Independent tasks are executed with both candidates, one after the other. Let D_i be the difference of the two
-distances of task i, h_i a prediction of it that was fixed before the task was drawn, and mu_i the mean of h_i over
-tasks that were drawn for this purpose only. Then
+Let D_i be the difference of the two distances of task i, h_i a prediction of it that was fixed before the task was
+drawn, and mu_i the mean of h_i over tasks that were drawn for this purpose only. Then
 
     X_i = D_i - w_i (h_i - mu_i)
 
 has the expected difference as its mean given all earlier tasks, whatever the prediction is, if the weight w_i follows
-from earlier tasks. So the predictions may improve from task to task. This is prediction-powered inference
-(Angelopoulos et al. 2023, Science 382) in a sequential form; Kilian, Cortinovis and Caron (arXiv 2505.18000) have
-another one.
-
-The mean m is rejected if the wealth of bets against it reaches 2 / beta, on either side (Ville's inequality). All bets
-follow from earlier tasks. There are two kinds:
+from earlier tasks: prediction-powered inference (Angelopoulos et al. 2023, Science 382) in a sequential form. The mean
+m is rejected if the wealth of bets against it reaches 2 / beta, on either side (Ville's inequality).
 
 - If no distance can exceed a stated number, X_i is bounded, and the bets are linear (Waudby-Smith and Ramdas 2024,
-  JRSS B 86). The wealth is then a nonnegative supermartingale, and the test is valid for any distribution.
-- Otherwise no test of a mean is valid for every distribution in finite samples (Bahadur and Savage 1956). A bet
-  multiplies the wealth by 1 + k tanh(b_i (X_i - m) / k), with b_i of the order of 1 / sqrt(i log i) standard
-  deviations. This is exact if X_i is symmetric about its mean, as a sign test is. As b_i decreases, asymmetry adds only
-  a convergent sum of third moments to the logarithm of the wealth, so that it matters less and less, as in asymptotic
-  confidence sequences (Waudby-Smith et al. 2024, Annals of Statistics 52).
+  JRSS B 86). The test is then valid for any distribution.
+- Otherwise a bet multiplies the wealth by 1 + k tanh(b_i (X_i - m) / k), with b_i of the order of 1 / sqrt(i log i)
+  standard deviations. This is exact if X_i is symmetric about its mean, as a sign test is, and otherwise asymptotic
+  (docs/theory.md).
 """
 
 from __future__ import annotations
@@ -49,10 +42,7 @@ class PairedDifferences:
         return np.asarray(self.values - _weights_so_far(self.values, self.predicted) * self.predicted)
 
     def log_wealth(self, mean: Array, *, above: bool) -> Array:
-        """Return the logarithm of the largest wealth so far, of bets that the true mean is above or below ``(...)``.
-
-        The shape is ``(..., N)``; it never decreases along the last axis.
-        """
+        """Return the log of the largest wealth ``(..., N)`` of bets that the true mean is above or below ``(...)``."""
         sign = 1.0 if above else -1.0
         against = sign * np.asarray(mean, dtype=np.float64)[..., None]
         if self.most is None:

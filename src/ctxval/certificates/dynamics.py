@@ -3,13 +3,12 @@ r"""The bound from learned dynamics: the posterior of ``d* = max_p d(p)`` under 
 The residual ``r(x, u) = x' - M(x, u)`` has a Gaussian-process prior with unknown hyperparameters. Each draw r_s from
 its posterior makes a system ``M + r_s``, whose largest distance d*_s is searched over all tasks. Under the prior, d*
 and these S maxima are exchangeable, so d* is at most the k-th smallest one with probability ``k / (S + 1)``. Draws
-that share hyperparameters make this approximate. Bayes' rule does not depend on how the tasks were chosen. If M is
-rougher than the system, a linear model takes its place in r (:mod:`ctxval.learning.residual_data`).
+that share hyperparameters make this approximate. If M is rougher than the system, a linear model takes its place in r
+(:mod:`ctxval.learning.residual_data`).
 
-The bound lies if the prior is wrong: if a state is not recorded, or the dynamics jump. So it is withdrawn by
-:mod:`ctxval.certificates.dynamics_diagnostics` unless predictions that were made before executions held, and unless the
-records cover what the closed loops visit. It is raised by half of the largest excess of the last executions over their
-predictions, and by far more if one of these predictions failed.
+The bound lies if the prior is wrong: if a state is not recorded, or the dynamics jump. So
+:mod:`ctxval.certificates.dynamics_diagnostics` withdraws it unless predictions held that were made before executions,
+and unless the records cover what the closed loops visit, and raises it if predictions failed.
 """
 
 from __future__ import annotations
@@ -22,32 +21,15 @@ import numpy as np
 
 from ctxval._util.checked import NonNegativeInt, Probability, checked
 from ctxval._util.registry import part
+from ctxval.certificates import dynamics_diagnostics as diagnostics
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.bounds import rank_within
 from ctxval.certificates.covering import largest_empty_box
-from ctxval.certificates.dynamics_diagnostics import (
-    ACCURATE,
-    PREDICTIONS,
-    counted,
-    doubt_of,
-    failed,
-    fewest_missing,
-    held,
-    raised,
-    tested,
-    tests_missing,
-)
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.prediction_tests import TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed, require_learned
-from ctxval.certificates.sentences.statements import (
-    ONE_CAMPAIGN,
-    both_outcomes,
-    dynamics_assumptions,
-    dynamics_statement,
-    two_distances,
-)
+from ctxval.certificates.sentences import statements
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError
@@ -64,10 +46,8 @@ class Dynamics(CertificateKind):
     needs_model: ClassVar[bool] = True
     takes_suites: ClassVar[bool] = True
 
-    #: the number of executions that must have been predicted beforehand at tasks drawn over the task space
-    tests: NonNegativeInt = TESTS
-    #: the share of the executions of each task that the bound is about, if they differ by noise
-    quantile: Probability = QUANTILE
+    tests: NonNegativeInt = TESTS  #: number of executions that must have been predicted beforehand at drawn tasks
+    quantile: Probability = QUANTILE  #: the share of the executions of each task that a bound with noise is about
 
     def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
         """Refuse a confidence that needs too many draws of the dynamics."""
@@ -102,10 +82,10 @@ class Dynamics(CertificateKind):
         if threshold is None or certificate.covers(threshold):
             return certificate
         bound = bound_of(evidence, sample.best, confidence)
-        if raised(evidence, bound) > threshold and certificate.doubt == tests_missing(evidence):
+        if diagnostics.raised(evidence, bound) > threshold and certificate.doubt == diagnostics.tests_missing(evidence):
             certificate = replace(certificate, doubt=None)  # missing tests matter only to a bound that suffices
         kept = float((evidence.maxima <= threshold).mean())
-        expected = Forecast(fewest_missing(evidence, sample.best, bound), kept, 1 - kept, fewest=True)
+        expected = Forecast(diagnostics.fewest_missing(evidence, sample.best, bound), kept, 1 - kept, fewest=True)
         return replace(certificate, expected=expected)
 
 
@@ -119,88 +99,78 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
     """Return the bound that d* stays below with the confidence, from evidence of the same trials."""
     rank_within(confidence, len(evidence.maxima))
     bound, error = bound_of(evidence, sample.best, confidence), evidence.error(confidence)
-    upper = raised(evidence, bound)
+    upper = diagnostics.raised(evidence, bound)
     if not np.isfinite(upper + error):
         raise CertificateError(
             "the dynamics give no bound: the closed loops of some posterior samples diverge, or an execution could not "
             "be predicted. More executions narrow them."
         )
-    finite, last = evidence.maxima[np.isfinite(evidence.maxima)], counted(evidence, bound)[-PREDICTIONS:]
-    tests = tested(evidence.predictions, evidence.tests)
+    finite = evidence.maxima[np.isfinite(evidence.maxima)]
+    last = diagnostics.counted(evidence, bound)[-diagnostics.PREDICTIONS :]
+    tests = diagnostics.tested(evidence.predictions, evidence.tests)
     drawn = [test.origin for test in tests]
-    coverage, worst = evidence.coverage, failed(evidence, bound)
-    doubt, differing = both_outcomes(sample, stochastic=False), sample.differing(1e-6 * bound)
+    coverage, worst = evidence.coverage, diagnostics.failed(evidence, bound)
+    doubt, differing = statements.both_outcomes(sample, stochastic=False), sample.differing(1e-6 * bound)
     # Two executions of one task must not differ by more than a prediction may be wrong.
-    if doubt is None and evidence.quantile is None and (rows := sample.differing(ACCURATE * bound)) is not None:
+    rows = sample.differing(diagnostics.ACCURATE * bound)
+    if doubt is None and evidence.quantile is None and rows is not None:
         doubt = (
-            f"{two_distances(sample, rows)} in the recorded state, or was changed in between, so the bound is "
-            "withdrawn; record more states, use --kind posterior, or use a new store after a change"
+            f"{statements.two_distances(sample, rows)} in the recorded state, or was changed in between, so the bound "
+            "is withdrawn; record more states, use --kind posterior, or use a new store after a change"
         )
     empty = None if sample.suite is not None else largest_empty_box(sample.points)
-    return Certificate(
-        kind="dynamics",
-        statement=dynamics_statement(upper, error, confidence, evidence.quantile),
-        upper_bound=upper,
-        confidence=confidence,
-        volume=0.0,
-        trials=len(sample),
-        assumptions=(*dynamics_assumptions(evidence), *sample.remarks, ONE_CAMPAIGN),
-        details={
-            "best": sample.best,
-            **({} if sample.suite is None else {"tasks": sample.tasks, "not_executed": sample.not_executed}),
-            "gap": upper - sample.best,
-            "raised_from": None if worst is None else bound,
-            "raised_by_trial": None if worst is None else worst.trial,
-            "error": error,
-            "executions": evidence.executions,
-            "draws": len(evidence.maxima),
-            "largest_draw": float(finite.max()) if len(finite) == len(evidence.maxima) else None,
-            "median_draw": float(np.median(finite)) if len(finite) else None,
-            "evaluations": evidence.evaluations,
-            "predictions": {
-                "made": len(evidence.predictions),
-                "stored_beforehand": sum(prediction.stored for prediction in evidence.predictions),
-                "last_ones": len(last),
-                "held": sum(held(prediction, bound) for prediction in last),
-            },
-            "tests": {
-                **shown_by_tests(drawn, sample.points.shape[1], confidence, uniform=sample.is_uniform),
-                "largest_error": max((test.error for test in tests), default=None),
-            },
-            "checked": [{**each.to_json(), "held": bool(held(each, bound))} for each in evidence.predictions],
-            "coverage_gap": coverage.marginal.size,
-            "beyond_the_records": coverage.beyond.size,
-            "coverage_gap_of_pairs": None if coverage.pair is None else coverage.pair.size,
-            "largest_gap_at": coverage.marginal.place,
-            "resolution": coverage.resolution,
-            "noise": evidence.noise,
-            "quantile": evidence.quantile,
-            "lags": evidence.lags,
-            "actuator": evidence.actuator and list(evidence.actuator),
-            "physical": list(evidence.physical),
-            "suspect": evidence.suspect and list(evidence.suspect),
-            "without_model": evidence.without_model,
-            "without_data": evidence.without_data,
-            "estimated": evidence.estimated,
-            "sharpness": evidence.sharpness,
-            "jump": evidence.jump,
-            "missed": evidence.missed,
-            "disagreement": evidence.disagreement,
-            "variance_left_out": evidence.left_out,
-            "pocket": evidence.pocket and asdict(evidence.pocket),
-            "empty_box": None if empty is None else asdict(empty),
-            "pushed": evidence.pushed and evidence.pushed.to_json(),
-            "failures": sample.failures,
-            "differing": None if differing is None else [sample.numbers[row] for row in differing],
+    statement = statements.dynamics_statement(upper, error, confidence, evidence.quantile)
+    assumptions = (*statements.dynamics_assumptions(evidence), *sample.remarks, statements.ONE_CAMPAIGN)
+    doubt, n = doubt or diagnostics.doubt_of(evidence, sample.best, bound), len(sample)
+    details = {
+        "best": sample.best,
+        **({} if sample.suite is None else {"tasks": sample.tasks, "not_executed": sample.not_executed}),
+        "gap": upper - sample.best,
+        "raised_from": None if worst is None else bound,
+        "raised_by_trial": None if worst is None else worst.trial,
+        "error": error,
+        "executions": evidence.executions,
+        "draws": len(evidence.maxima),
+        "largest_draw": float(finite.max()) if len(finite) == len(evidence.maxima) else None,
+        "median_draw": float(np.median(finite)) if len(finite) else None,
+        "evaluations": evidence.evaluations,
+        "predictions": {
+            "made": len(evidence.predictions),
+            "stored_beforehand": sum(prediction.stored for prediction in evidence.predictions),
+            "last_ones": len(last),
+            "held": sum(diagnostics.held(prediction, bound) for prediction in last),
         },
-        doubt=doubt or doubt_of(evidence, sample.best, bound),
-        error=error,
-    )
+        "tests": {
+            **shown_by_tests(drawn, sample.points.shape[1], confidence, uniform=sample.is_uniform),
+            "largest_error": max((test.error for test in tests), default=None),
+        },
+        "checked": [{**each.to_json(), "held": bool(diagnostics.held(each, bound))} for each in evidence.predictions],
+        "coverage_gap": coverage.marginal.size,
+        "beyond_the_records": coverage.beyond.size,
+        "coverage_gap_of_pairs": None if coverage.pair is None else coverage.pair.size,
+        "largest_gap_at": coverage.marginal.place,
+        "resolution": coverage.resolution,
+        "noise": evidence.noise,
+        "quantile": evidence.quantile,
+        "lags": evidence.lags,
+        "actuator": evidence.actuator and list(evidence.actuator),
+        "physical": list(evidence.physical),
+        "suspect": evidence.suspect and list(evidence.suspect),
+        **{name: getattr(evidence, name) for name in ("without_model", "without_data", "estimated")},
+        **{name: getattr(evidence, name) for name in ("sharpness", "jump", "missed", "disagreement")},
+        "variance_left_out": evidence.left_out,
+        "pocket": evidence.pocket and asdict(evidence.pocket),
+        "empty_box": None if empty is None else asdict(empty),
+        "pushed": evidence.pushed and evidence.pushed.to_json(),
+        "failures": sample.failures,
+        "differing": None if differing is None else [sample.numbers[row] for row in differing],
+    }
+    return Certificate("dynamics", statement, upper, confidence, 0.0, n, assumptions, details, doubt, error)
 
 
 def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> float:
     """Return the order statistic of the maxima, raised by what searches and predictions have missed."""
-    excess = max((prediction.excess for prediction in evidence.predictions[-PREDICTIONS:]), default=0.0)
+    excess = max((prediction.excess for prediction in evidence.predictions[-diagnostics.PREDICTIONS :]), default=0.0)
     upper = evidence.upper(confidence) * evidence.missed
     # A noisy execution may exceed the quantile that is bounded.
     return (max(upper, best) if evidence.quantile is None else upper) + 0.5 * excess

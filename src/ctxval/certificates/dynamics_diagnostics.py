@@ -124,8 +124,7 @@ def failed(evidence: DynamicsEvidence, bound: float) -> CheckedPrediction | None
 def raised(evidence: DynamicsEvidence, bound: float) -> float:
     """Return a bound that the errors of the last predictions leave credible.
 
-    A prediction that failed raises the bound by so much that its error is a small share of the rise. So a threshold far
-    above the bound is kept in spite of it, and one near the bound is not.
+    The error of a prediction that failed is a small share of the rise, so only a threshold far above the bound is kept.
     """
     worst = failed(evidence, bound)
     return bound if worst is None else bound + worst.error / ACCURATE

@@ -26,19 +26,15 @@ class CheckedPrediction(ShortRepr):
     median: float  #: median of the predicted distances; infinity if nothing was predicted
     upper: float  #: 0.95 quantile of the predicted distances; infinity if more draws than that diverged
     distance: float  #: the executed distance
-    #: squared standardised error, the larger one of the trajectory and of the distance; NaN if it is not known
-    z2: float = np.nan
+    z2: float = np.nan  #: squared standardised error, the larger one of trajectory and distance; NaN if it is not known
     stored: bool = True  #: whether the prediction was stored before the execution; if not, it was computed afterwards
     new: bool = True  #: whether the task differs from those that were executed before
     origin: Origin = "acquisition"  #: the reason why the task was chosen
     point: tuple[float, ...] = ()  #: the task, a point of the unit cube ``(d,)``
-    #: quantiles of the predicted distances at ``quantiles.LEVELS`` if the system is noisy; else empty
-    quantiles: tuple[float, ...] = ()
+    quantiles: tuple[float, ...] = ()  #: those of the predicted distances at ``quantiles.LEVELS``; empty without noise
     runs: int = 0  #: the number of predicted distances that these are of
-    #: predicted probabilities of more than what statistics of the trajectory are; empty without noise
-    p_values: tuple[float, ...] = ()
-    #: the distance of the task on what all executions teach together; None if it is not known
-    explained: float | None = None
+    p_values: tuple[float, ...] = ()  #: chances of more than statistics of the trajectory; empty without noise
+    explained: float | None = None  #: the distance of the task on what all executions teach; None if it is not known
 
     @property
     def is_noisy(self) -> bool:
@@ -64,10 +60,8 @@ class CheckedPrediction(ShortRepr):
     def to_json(self) -> dict[str, Any]:
         """Return all attributes but the quantiles, ready for JSON: numbers that are not finite are None."""
         plain = {name: value for name, value in asdict(self).items() if name not in ("quantiles", "runs")}
-        return {
-            name: None if isinstance(value, float) and not np.isfinite(value) else value
-            for name, value in plain.items()
-        }
+        unknown = [name for name, value in plain.items() if isinstance(value, float) and not np.isfinite(value)]
+        return {**plain, **dict.fromkeys(unknown)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +91,7 @@ class Tolerance:
 class PushedDistances(ShortRepr):
     """The largest distances if something that no record shows pushes a state, on the posterior mean."""
 
-    #: the largest recorded residual of the rate of change of each pushed state, by its label
-    residuals: dict[str, float]
+    residuals: dict[str, float]  #: largest recorded residual of the rate of change of each pushed state, by its label
     levels: Array  #: the sizes of the pushes as multiples of these residuals, ascending from 0, shape ``(L,)``
     everywhere: Array  #: the largest distance for each state and size, shape ``(k, L)``
     away: Array  #: the same if the push acts only where no record is near
@@ -152,35 +145,24 @@ class DynamicsEvidence(ShortRepr):
     groups: int = 2  #: number of draws that share hyperparameters
     unplanned: float = 0.0  #: share of the tasks for which no controller can be designed, or on which M diverges
     untried: UntriedParameter | None = None  #: a parameter that M's loops do not depend on; None if there is none
-    #: the corner of a position that is farthest from executed tasks; None if no parameter is a position
-    corner: UntriedCorner | None = None
+    corner: UntriedCorner | None = None  #: the corner of a position farthest from executed tasks; None without any
     without_model: bool = False  #: whether the system was learned without M, because M is rougher than the system
-    #: largest share by which a large distance on the mean exceeds those of tasks that are nearly the same
-    sharpness: float = 0.0
-    #: largest jump of the distance on the mean between tasks that are nearly the same, at random tasks; 0 if it was not
-    #: computed, because the bound is withdrawn anyway
-    jump: float = 0.0
-    #: whether there are so few task parameters that deeper searches can find what lies between jumps
-    dense: bool = False
-    #: factor by which the largest distance on the mean is larger in two deeper searches; at least 1
-    missed: float = 1.0
+    sharpness: float = 0.0  #: largest share by which a large distance on the mean exceeds those of nearly same tasks
+    jump: float = 0.0  #: largest jump of the distance on the mean between nearly the same tasks; 0 if not computed
+    dense: bool = False  #: whether task parameters are so few that deeper searches can find what lies between jumps
+    missed: float = 1.0  #: factor by which the largest distance on the mean is larger in deeper searches; at least 1
     disagreement: float = 0.0  #: share by which the smaller result of these searches is below the larger one
     tests: int = TESTS  #: the number of tests that a bound needs; see :mod:`~ctxval.certificates.prediction_tests`
-    #: the largest distances if something pushes the system; None if the bound is withdrawn anyway
-    pushed: PushedDistances | None = None
-    #: the share of the executions of a task whose distances are below the maxima; None if the system is not noisy, so
-    #: that all are alike
-    quantile: float | None = None
+    pushed: PushedDistances | None = None  #: largest distances under pushes; None if the bound is withdrawn anyway
+    quantile: float | None = None  #: share of the executions of a task that are below the maxima; None without noise
     lags: int = 0  #: number of earlier records and inputs that the learned dynamics depend on
-    #: the delay and the time constant, in steps, with which inputs act; None if they act at once
-    actuator: tuple[float, float] | None = None
+    actuator: tuple[float, float] | None = None  #: delay and time constant of inputs in steps; None if they act at once
     pocket: StatePocket | None = None  #: the largest region that no execution has entered; None if it is not known
     physical: tuple[str, ...] = ()  #: the task parameters that the learned dynamics depend on
     #: another one that they seem to depend on, and how many times less predictions of executions from the others err
     #: with it; None if predictions hold, or if there is none
     suspect: tuple[str, float] | None = None
-    #: whether the data that M was made from are left out, because they contradict the executions
-    without_data: bool = False
+    without_data: bool = False  #: whether the data that M was made from are left out, as they contradict the executions
     estimated: bool = False  #: whether states of M are estimated from recorded outputs
 
     def rank(self, confidence: float) -> int:

@@ -16,7 +16,7 @@ If a few recorded transitions are no smooth function of what is recorded, as tho
 the draws are learned from the others alone (:mod:`ctxval.learning.regular`), and a task is no part of the envelope if
 its run comes to states like those of the few. The tests are predicted from the executions of all other tasks.
 
-Between these tasks, ``mean + k spread`` is interpolated (:mod:`ctxval.certificates.envelope_surface`). The largest
+Between these tasks, ``mean + k spread`` is interpolated (:mod:`ctxval.certificates.envelope_shape`). The largest
 error of the nearest tasks, if each of them is interpolated from all others, is added. Further tasks of the set check
 this: errors are multiplied until hardly any of these tasks has ``mean + k spread`` above the threshold.
 """
@@ -30,12 +30,12 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, as_floats, require_shape
+from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats, require_shape
 from ctxval._util.boxes import separated_rows
 from ctxval._util.files import write_text
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
-from ctxval.certificates.drawn_distances import FLOOR, LARGEST, DrawnDistances
+from ctxval.certificates.bounds import rank_within
 from ctxval.certificates.dynamics_diagnostics import (
     PREDICTIONS,
     agrees,
@@ -47,19 +47,72 @@ from ctxval.certificates.dynamics_diagnostics import (
     untried_parameter,
 )
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
-from ctxval.certificates.envelope_surface import Surfaces, exported, write_onnx
-from ctxval.certificates.envelope_words import Region, regions_inside
+from ctxval.certificates.envelope_shape import Region, Surfaces, exported, regions_inside, write_onnx
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.sentences.statements import IRREGULAR, dynamics_assumptions, envelope_statement
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TaskSuite
 from ctxval.errors import InputError
 
+FLOOR = 0.005  # least spread, as a share of the threshold
+LARGEST = 2.0  # multiple of the threshold up to which bounds are told apart
 COUNTED = 4096  # tasks of which the share in the envelope is counted
 _EXCEEDED = 1.02  # an executed distance above the threshold counts as at least this multiple of it
 _SAME = 1e-9
 _SAME_TASK = 1e-6
 _WORTH = 0.8  # share of the tasks predicted below the threshold that tests may leave in the envelope
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnDistances(ShortRepr):
+    """The distances of some tasks on draws of the learned dynamics."""
+
+    points: Array  #: tasks, points of the unit cube ``(K, d)``
+    draws: Array  #: distances on S draws ``(S, K)``; infinity if a loop diverges, NaN if no controller can be designed
+    beyond: Array  #: how far the loop on the mean leaves the records, as a share of the visited range ``(K,)``
+    #: how far it comes from places that executions entered ``(K,)``, as a share of what is allowed; 0 without positions
+    away: Array
+    crossed: Array | None = None  #: how far it crosses the boundary of the regular part, from -1 to 1; None without one
+
+    @property
+    def known(self) -> Mask:
+        """Which tasks have a finite distance on each draw, ``(K,)``."""
+        return np.asarray(np.isfinite(self.draws).all(axis=0))
+
+    @property
+    def mean(self) -> Array:
+        """The means over the draws ``(K,)``; infinity if a distance is not known."""
+        return np.where(self.known, np.where(self.known, self.draws, 0.0).mean(axis=0), np.inf)
+
+    def spread(self, threshold: float) -> Array:
+        """Return the standard deviations over the draws ``(K,)``, at least a share of the threshold."""
+        return np.asarray(np.maximum(np.where(self.known, self.draws, 0.0).std(axis=0), FLOOR * threshold))
+
+    def factor(self, threshold: float, confidence: float) -> float:
+        """Return k: the order statistic of the largest standardised excesses of the draws; at least 1."""
+        known, spread = self.known, self.spread(threshold)
+        excess = ((self.draws - self.mean)[:, known] / spread[known]).max(axis=1, initial=0.0)
+        return max(1.0, float(np.sort(excess)[rank_within(confidence, len(excess)) - 1]))
+
+    def and_others(self, others: DrawnDistances) -> DrawnDistances:
+        """Return these tasks together with others on the same draws."""
+        return DrawnDistances(
+            np.concatenate([self.points, others.points]),
+            np.concatenate([self.draws, others.draws], axis=1),
+            np.concatenate([self.beyond, others.beyond]),
+            np.concatenate([self.away, others.away]),
+            None if self.crossed is None or others.crossed is None else np.concatenate([self.crossed, others.crossed]),
+        )
+
+    def leaving(self, most: float) -> Array:
+        """Return how far loops leave records and places, or cross the boundary ``(K,)``; nothing is known above 1."""
+        # Both have the same slope: smaller slopes cost more of the set, because their errors reach farther.
+        beyond = self.beyond if self.crossed is None else np.maximum(self.beyond, most + self.crossed)
+        return np.asarray(np.minimum(np.maximum(beyond / most, self.away), LARGEST))
+
+    def upper(self, factor: float, threshold: float) -> Array:
+        """Return mean + k spread as shares of the threshold ``(K,)``, at most ``LARGEST``."""
+        return np.asarray(np.minimum((self.mean + factor * self.spread(threshold)) / threshold, LARGEST))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,24 +125,18 @@ class Envelope(ShortRepr):
     confidence: float
     statement: str  #: what it says, in one sentence
     share: float = 0.0  #: the share of the tasks that are trusted
-    #: the largest boxes and half-spaces inside it, the largest first; empty for a suite
-    regions: tuple[Region, ...] = ()
-    #: the names of the trusted tasks of a suite; None if the task space is no suite
-    tasks: tuple[str, ...] | None = None
+    regions: tuple[Region, ...] = ()  #: the largest boxes and half-spaces inside it, the largest first; not for a suite
+    tasks: tuple[str, ...] | None = None  #: the names of the trusted tasks of a suite; None if it is no suite
     factor: float | None = None  #: k, by how many spreads the mean must stay below the threshold
-    #: the trial that raised k, by its excess over its prediction or because the draws miss its distance; None if there
-    #: is none
-    raised_by: int | None = None
-    #: the median of what the interpolation adds next to evaluated tasks, as a share of the threshold
-    margin: float = 0.0
+    raised_by: int | None = None  #: the trial that raised k, as predictions or draws miss its distance; else None
+    margin: float = 0.0  #: the median of what the interpolation adds near evaluated tasks, as a share of the threshold
     evaluated: int = 0  #: the number of tasks at which closed loops were run
     checks: int = 0  #: the number of further tasks that checked the interpolation between these
     uncovered: float = 0.0  #: the share of the tasks that are not trusted only because predicted runs leave the records
     #: executions, tests: numbers of executions, and of those that were predicted beforehand at drawn tasks
     executions: int = 0
     tests: int = 0
-    #: the share of the executions of a task whose distances are below tau; None if the system is not noisy
-    quantile: float | None = None
+    quantile: float | None = None  #: the share of the executions of a task that are below tau; None without noise
     assumptions: tuple[str, ...] = ()  #: what it assumes
     #: the number of recorded steps, such as contacts, that are no part of what is learned; a task is not trusted if its
     #: run comes to states like theirs
@@ -216,10 +263,7 @@ def _raised(
 ) -> tuple[float, int | None]:
     """Return k, and the trial that raised it; None if it is that of the draws.
 
-    It is at least the largest standardised excess of the predictions that count, and the largest standardised error of
-    the draws at the tasks that they were learned from. They hardly miss any if the next state is a function of what is
-    recorded. Stiff contacts and hidden states are missed in both directions, so a distance that is too small counts as
-    well: it is too large elsewhere. Nothing is claimed of tasks that the draws have above the threshold.
+    Contacts and hidden states are missed in both directions, so a distance that is too small counts as well.
     """
     factor, rises = drawn.factor(threshold, confidence), rises_of(evidence, threshold)
     if evidence.quantile is None:  # else noise explains the differences
@@ -294,7 +338,6 @@ def envelope_of(
         executed: points of the unit cube ``(d,)`` with their distances.
         evaluate: returns the distances of further tasks on the same draws; None if the interpolation is not checked.
         checks: the number of these tasks.
-        units: the units of the distance.
         irregular: the number of recorded steps that the draws are not learned from.
     """
     factor, raised_by = _raised(drawn, evidence, threshold, confidence)
@@ -334,11 +377,7 @@ def envelope_of(
 
 
 def _of_suite(
-    envelope: Envelope,
-    suite: TaskSuite,
-    drawn: DrawnDistances,
-    most: float,
-    executed: Sequence[tuple[Array, float]],
+    envelope: Envelope, suite: TaskSuite, drawn: DrawnDistances, most: float, executed: Sequence[tuple[Array, float]]
 ) -> Envelope:
     threshold, bounds = envelope.threshold, np.full(len(suite), np.inf)
     uncovered = np.zeros(len(suite), dtype=np.bool_)

@@ -9,7 +9,6 @@ import numpy as np
 from ctxval._util.arrays import single_threaded
 from ctxval.certificates.maxima import Maxima
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.sentences.verdicts import outlook
 from ctxval.gp.hyperposterior import Conditioned
 
 HORIZON = 200
@@ -21,15 +20,21 @@ _JITTER = 1e-9  # added to variances, relative to the distance's, so that the co
 class Forecast:
     """Forecast of further executions."""
 
-    #: number of executions after which half of the simulated futures are decided, or the fewest that can decide; None
-    #: if it exceeds ``HORIZON``
-    executions: int | None
+    executions: int | None  #: the fewest that can decide, or the median of simulated futures; None above ``HORIZON``
     validated: float  #: share of the futures, or of the posterior samples of the dynamics, that validate the threshold
     falsified: float  #: share of them in which a distance exceeds the threshold
     fewest: bool = False  #: whether ``executions`` is the fewest that can decide
 
     def __str__(self) -> str:
-        return outlook(self, HORIZON)
+        plural = "execution is" if self.executions == 1 else "executions are"
+        if self.fewest:
+            share = f"{100 * self.validated:.0f} % of the posterior samples of the dynamics stay below the threshold"
+            return f"at least {self.executions} more {plural} needed to validate it, and {share}"
+        many = f"about {self.executions}" if self.executions is not None else f"more than {HORIZON}"
+        shares = {"validated": self.validated, "falsified": self.falsified}
+        answer = max(shares, key=lambda name: shares[name])
+        outcome = f" ({answer} in {100 * shares[answer]:.0f} % of the simulated futures)" if shares[answer] else ""
+        return f"{many} more {plural} expected to decide{outcome}"
 
 
 def forecast(
@@ -37,24 +42,18 @@ def forecast(
 ) -> Forecast:
     """Return how many more executions of GP-UCB decide whether d* is at most the threshold, from draws of d*.
 
-    Each future takes one draw of the hyperparameters, from those whose draws of d* exceed the threshold if there are
-    any. It draws a true distance function from the posterior on candidate tasks, and searches it with GP-UCB. It is
-    decided when a distance above the threshold is executed, or when the upper bound falls to the threshold. The bound
-    keeps the number of standard deviations above the mean that it has now.
+    Each future takes one draw of the hyperparameters, from those that exceed the threshold if there are any. It
+    searches a draw of the distance on candidate tasks, until a distance exceeds the threshold or the bound keeps it.
     """
     rng = np.random.default_rng(seed)
-    lengths, kept = [], 0
+    in_the_way = maxima.owners[maxima.draws > threshold]
+    owners = in_the_way if len(in_the_way) else maxima.owners
+    chosen = [maxima.conditioned[owners[k * len(owners) // futures]] for k in range(futures)]
     with single_threaded():
-        in_the_way = maxima.owners[maxima.draws > threshold]
-        owners = maxima.owners if not len(in_the_way) else in_the_way
-        for k in range(futures):
-            conditioned = maxima.conditioned[owners[k * len(owners) // futures]]
-            length, validated = _future(sample, maxima, conditioned, threshold, confidence, rng)
-            lengths.append(length)
-            kept += validated
-    decided = np.isfinite(lengths)
-    half = float(np.quantile(lengths, 0.5, method="higher"))
-    return Forecast(int(half) if np.isfinite(half) else None, kept / futures, (int(decided.sum()) - kept) / futures)
+        ends = [_future(sample, maxima, conditioned, threshold, confidence, rng) for conditioned in chosen]
+    lengths, kept = [length for length, _ in ends], sum(validated for _, validated in ends)
+    half, decided = float(np.quantile(lengths, 0.5, method="higher")), int(np.isfinite(lengths).sum())
+    return Forecast(int(half) if np.isfinite(half) else None, kept / futures, (decided - kept) / futures)
 
 
 def _future(

@@ -35,8 +35,7 @@ class Maxima(ShortRepr):
     points: Array  #: a maximiser of each draw's path, in the unit cube, shape ``(S, d)``
     conditioned: list[Conditioned]  #: the processes under each draw of the hyperparameters
     owners: Rows  #: index into ``conditioned`` of each draw, shape ``(S,)``
-    #: whether two executions of one task may differ, so that d* is the largest expected distance
-    stochastic: bool = False
+    stochastic: bool = False  #: whether executions of one task may differ, so that d* is the largest expected one
 
     def upper(self, confidence: float) -> float:
         """Return the bound on d* that holds with this probability; a CertificateError if that needs more draws."""
@@ -145,12 +144,12 @@ def _require_bounding(sample: Sample) -> None:
         )
     if len(sample) < FEWEST:
         raise CertificateError(f"a posterior bound needs at least {FEWEST} trials, got {len(sample)}.")
-    if np.ptp(sample.distances) == 0:
+    spread, largest = float(np.ptp(sample.distances)), float(np.abs(sample.distances).max())
+    if spread == 0:
         raise CertificateError(
             f"all {len(sample)} distances are {sample.distances[0]:g}: they do not bound d*. Check that the distance "
             "compares what differs; an audit bounds how many tasks are worse."
         )
-    spread, largest = float(np.ptp(sample.distances)), float(np.abs(sample.distances).max())
     if spread < 1e-14 * largest:
         raise CertificateError(f"the distances differ from {largest:g} by rounding alone: they do not bound d*.")
     if spread < 1 / _EXTREME or largest > _EXTREME:

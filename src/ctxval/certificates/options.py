@@ -18,20 +18,10 @@ LEAST_CONFIDENCE = 0.5
 MOST_VOLUME = 0.5
 
 _NO_LESS = "with less, a verdict would be wrong more often than right"
-Confidence = Annotated[
-    float,
-    Must(
-        f"from {LEAST_CONFIDENCE:g} to below 1 ({_NO_LESS}; {CONFIDENCE:g} is usual)",
-        lambda value: LEAST_CONFIDENCE <= value < 1,
-    ),
-]
-Volume = Annotated[
-    float,
-    Must(
-        f"a share of the task space from 0 to {MOST_VOLUME:g} (more would leave out most of the tasks)",
-        lambda value: 0 <= value <= MOST_VOLUME,
-    ),
-]
+_PROBABILITY = f"from {LEAST_CONFIDENCE:g} to below 1 ({_NO_LESS}; {CONFIDENCE:g} is usual)"
+_SHARE = f"a share of the task space from 0 to {MOST_VOLUME:g} (more would leave out most of the tasks)"
+Confidence = Annotated[float, Must(_PROBABILITY, lambda value: LEAST_CONFIDENCE <= value < 1)]
+Volume = Annotated[float, Must(_SHARE, lambda value: 0 <= value <= MOST_VOLUME)]
 
 
 @checked
@@ -41,8 +31,7 @@ class CertificateOptions(ShortRepr):
 
     kind: CertificateKind = field(default_factory=Automatic)  #: the kind of certificate, with its own options
     confidence: Confidence = CONFIDENCE  #: confidence level of the certificate, at least 0.5
-    #: the share of the task space that may exceed the threshold, at most 0.5; if it is 0, only bounds on d* validate
-    volume: Volume = 0.0
+    volume: Volume = 0.0  #: share of the tasks that may exceed the threshold; if it is 0, only bounds on d* validate
 
     @classmethod
     def or_automatic(

@@ -1,14 +1,12 @@
 r"""The Gaussian-process bound: the posterior of ``d* = max_p d(p)`` given all trials, however they were chosen.
 
 The bound is an order statistic of draws of d*. Under the prior, S independent draws and the truth are exchangeable, so
-the truth is at most the k-th smallest draw with probability ``k / (S + 1)``. Here groups of draws share
-hyperparameters, so this holds approximately. Bayes' rule does not depend on why a task was chosen or why the campaign
-stopped, so the bound holds after adaptive sampling. It rests on the prior, so it is withdrawn if the trials contradict
-the process or do not cover the tasks (:func:`diagnose`). Each trial is predicted from those before it. Under the
-process, the standardised error of each prediction follows a t distribution, and these errors are independent, whatever
-chose the tasks (recursive residuals; Brown, Durbin and Evans 1975). The order of trials that people chose or imported
-has no meaning, so each of them is predicted from all others. Its standardised error follows a t distribution as well
-(externally studentised residuals; Cook and Weisberg 1982), if the tasks were not chosen by the distances.
+the truth is at most the k-th smallest draw with probability ``k / (S + 1)``; groups of draws share hyperparameters, so
+this holds approximately. The bound is withdrawn if the trials contradict the process or do not cover the tasks
+(:func:`diagnose`). Each trial is predicted from those before it: the standardised errors are independent and follow t
+distributions, whatever chose the tasks (recursive residuals; Brown, Durbin and Evans 1975). The order of trials that
+people chose or imported has no meaning, so each of them is predicted from all others (externally studentised residuals;
+Cook and Weisberg 1982).
 """
 
 from __future__ import annotations
@@ -29,13 +27,7 @@ from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, far
 from ctxval.certificates.forecast import forecast
 from ctxval.certificates.maxima import MOST, Maxima, draw_maxima, representative, settle_maxima
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.sentences import withdrawals
-from ctxval.certificates.sentences.statements import (
-    ONE_CAMPAIGN,
-    both_outcomes,
-    posterior_assumptions,
-    posterior_statement,
-)
+from ctxval.certificates.sentences import statements, withdrawals
 from ctxval.errors import CertificateError, InputError
 from ctxval.gp.acquisition import UpperConfidenceBound, maximise
 from ctxval.gp.hyperposterior import Conditioned
@@ -57,10 +49,7 @@ class Posterior(CertificateKind):
     resolution: PositiveFloat = RESOLUTION
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return the bound that d* stays below with the confidence, under the prior and given the trials.
-
-        There are enough draws for the threshold, and a forecast if the bound is above that.
-        """
+        """Return the bound that d* stays below with the confidence, and a forecast if it is above the threshold."""
         threshold = sample.threshold
         # Many trials that do not cover the tasks are refused before the draws, which take long.
         if len(sample) > MOST and (farthest := farthest_task(sample.points)) > self.resolution:
@@ -78,53 +67,37 @@ class Posterior(CertificateKind):
     @checked
     def certify_drawn(self, sample: Sample, drawn: Maxima, confidence: Probability = 0.95) -> Certificate:
         """Return the certificate from draws of d*, which were made from the same trials."""
-        used = representative(sample)
-        stochastic = drawn.stochastic
+        used, processes, stochastic = representative(sample), drawn.conditioned, drawn.stochastic
         upper, error = drawn.upper(confidence), drawn.error(confidence)
-        unordered, d = np.array([origin == "manual" for origin in used.origins]), sample.points.shape[1]
+        manual, resolution = np.array([origin == "manual" for origin in used.origins]), self.resolution
         diagnosis = diagnose(
-            drawn.conditioned,
-            used.points,
-            used.numbers,
-            unordered=unordered,
-            resolution=self.resolution,
-            covered=sample.points,
+            processes, used.points, used.numbers, unordered=manual, resolution=resolution, covered=sample.points
         )
-        hyperparameters = [process.hyperparameters for process in drawn.conditioned]
-        rough = float(np.mean([each.nu == 1.5 for each in hyperparameters]))
-        return Certificate(
-            kind=self.name,
-            statement=posterior_statement(upper, error, confidence, stochastic=stochastic),
-            upper_bound=upper,
-            confidence=confidence,
-            volume=0.0,
-            trials=len(sample),
-            assumptions=(
-                *posterior_assumptions(sample, len(used), self.resolution, stochastic=stochastic),
-                *sample.remarks,
-                ONE_CAMPAIGN,
-            ),
-            details={
-                "best": sample.best,
-                "gap": upper - sample.best,
-                "error": error,
-                "draws": len(drawn.draws),
-                "stochastic": stochastic,
-                "resolution": {
-                    "diagonals": self.resolution,
-                    "of_each_range": self.resolution * float(np.sqrt(d)),
-                    "of_the_space": resolved_volume(self.resolution, d),
-                },
-                "instantaneous": instantaneous_bound(used),
-                "kernels": {"matern-3/2": rough, "matern-5/2": 1 - rough},
-                "logarithm": float(np.mean([np.isfinite(process.warp.offset) for process in drawn.conditioned])),
-                "length_scales": np.median(np.exp([each.log_scales for each in hyperparameters]), axis=0).tolist(),
-                "diagnosis": {name: value for name, value in vars(diagnosis).items() if name != "doubt"},
-                "failures": sample.failures,
+        hyperparameters = [process.hyperparameters for process in processes]
+        rough, d = float(np.mean([each.nu == 1.5 for each in hyperparameters])), sample.points.shape[1]
+        assumed = statements.posterior_assumptions(sample, len(used), resolution, stochastic=stochastic)
+        details = {
+            "best": sample.best,
+            "gap": upper - sample.best,
+            "error": error,
+            "draws": len(drawn.draws),
+            "stochastic": stochastic,
+            "resolution": {
+                "diagonals": resolution,
+                "of_each_range": resolution * float(np.sqrt(d)),
+                "of_the_space": resolved_volume(resolution, d),
             },
-            doubt=both_outcomes(sample, stochastic=stochastic) or diagnosis.doubt,
-            error=error,
-        )
+            "instantaneous": instantaneous_bound(used),
+            "kernels": {"matern-3/2": rough, "matern-5/2": 1 - rough},
+            "logarithm": float(np.mean([np.isfinite(process.warp.offset) for process in processes])),
+            "length_scales": np.median(np.exp([each.log_scales for each in hyperparameters]), axis=0).tolist(),
+            "diagnosis": {name: value for name, value in vars(diagnosis).items() if name != "doubt"},
+            "failures": sample.failures,
+        }
+        statement = statements.posterior_statement(upper, error, confidence, stochastic=stochastic)
+        doubt = statements.both_outcomes(sample, stochastic=stochastic) or diagnosis.doubt
+        assumptions, n = (*assumed, *sample.remarks, statements.ONE_CAMPAIGN), len(sample)
+        return Certificate(self.name, statement, upper, confidence, 0.0, n, assumptions, details, doubt, error)
 
 
 def instantaneous_bound(sample: Sample) -> dict[str, float] | None:
@@ -168,11 +141,10 @@ def diagnose(
     resolution: float = RESOLUTION,
     covered: Array | None = None,
 ) -> Diagnosis:
-    """Return how well the values agree with the process, and how well the trials cover the tasks.
+    """Return how well the values agree with the processes, and how well the trials cover the tasks.
 
     Args:
-        conditioned: the processes of all draws of the hyperparameters, with the values in the order of the trials.
-        X: the trials' points ``(n, d)``, with ``numbers``; 0, 1, ... by default.
+        X: the trials' points ``(n, d)``, in the order of the values, with ``numbers``; 0, 1, ... by default.
         unordered: which trials have an order without meaning, shape ``(n,)``; none by default.
         resolution: a task that is farther than this from every trial withdraws the bound, in diagonals.
         covered: points that cover tasks, if there are more than X.
@@ -182,21 +154,21 @@ def diagnose(
     if unordered is not None and unordered.any():
         exceed[unordered] = np.mean([_left_out_exceedances(process) for process in conditioned], axis=0)[unordered]
     worst = int(np.nanargmin(exceed))
-    others = "other trials" if unordered is not None and unordered[worst] else "trials before it"
     trial = worst if numbers is None else numbers[worst]
     tested = int(np.isfinite(exceed).sum())
     surprise = float(-np.expm1(tested * np.log1p(-min(exceed[worst], 1 - 1e-16))))
     left_out = float(np.sqrt(np.mean([_left_out(process) for process in conditioned])))
-    covering_points = X if covered is None else covered
-    farthest, d, doubt = farthest_task(covering_points), X.shape[1], None
+    covered = X if covered is None else covered
+    farthest, d, doubt = farthest_task(covered), X.shape[1], None
     if surprise < LEVEL:
+        others = "other trials" if unordered is not None and unordered[worst] else "trials before it"
         deviations = -ndtri(max(exceed[worst], 1e-300))
         doubt = withdrawals.SURPRISING.format(trial=trial, deviations=deviations, others=others)
     elif farthest > resolution:
-        missing = covering(covering_points, resolution, 100)
+        missing = covering(covered, resolution, 100)
         many = "more than 100" if missing is None else f"{len(missing)}"
         doubt = withdrawals.FAR_TASK.format(farthest=farthest, resolution=resolution, many=many)
-    elif bare := len(bare_corners(covering_points, resolution)):
+    elif bare := len(bare_corners(covered, resolution)):
         where = "ends of the task parameter's range" if d == 1 else "corners of the task space"
         doubt = withdrawals.BARE_CORNERS.format(bare=bare, corners=2**d, where=where)
     return Diagnosis(surprise, trial, left_out, farthest, doubt)

@@ -1,24 +1,15 @@
 r"""Tests that could have failed: executions that are predicted beforehand at tasks where nobody chose to look.
 
-A search looks where distances are large, so it may never see that the dynamics are other in some tasks. Before a bound
-is believed, executions must have been predicted at a number of tasks that are drawn for this. They are the points of
-Latin hypercubes of ``TESTS`` points: each of ``TESTS`` equal parts of each parameter's range has a test, so what is
-other in one of these parts is met with certainty. Independent draws meet it with a probability of 66 %.
-
-The tests also tell how many tasks exceed a threshold, whatever the system is, if none of them exceeds it. A set of a
-share v of the tasks is missed by n independent draws with probability ``(1 - v)^n``. No design that has a test in each
-part of two parameters keeps this: n such points fill one of n! arrangements of n cells. One of these has a probability
-of at least ``1 / n!``, and then all points miss the tasks outside of it, whose share is ``1 - 1 / n``. This is more
-than ``n^-n``. For m points of a hypercube in d parameters, in random order, the probability is at most
+A search looks where distances are large, so it may never see that the dynamics are other in some tasks. So executions
+must have been predicted at the points of Latin hypercubes of ``TESTS`` points: what is other in one of ``TESTS`` equal
+parts of a parameter's range is met with certainty. The tests also tell how many tasks exceed a threshold, whatever the
+system is, if none of them exceeds it: a set of a share v of the tasks is missed by n independent draws with probability
+``(1 - v)^n``, and by m points of a hypercube of n points in d parameters with a probability of at most
 
 .. math:: G^{(d-1)}(1 - v)^m, \qquad G(x) = \varphi(n x) / \varphi(n), \qquad \varphi(r) = (r!)^{1/r},
 
-with linear interpolation of :math:`\varphi` between integers and :math:`\varphi(0) = 0`. With two parameters, the
-probability is a permanent over n!, and Bregman's theorem bounds it by a product of G over the rows; fractions of cells
-are mixtures of whole ones, because a permanent is linear in each row. Each further parameter applies G once more,
-because G is concave, and the inequalities of Maclaurin bound the mean over the order of the rows. It is
-``(1 - v)^m`` in one parameter. From ``MANY`` tests on, tests are independent draws instead: these meet one part of
-``TESTS`` with a probability of 95 %.
+with linear interpolation of :math:`\varphi` between integers and :math:`\varphi(0) = 0`; docs/theory.md has the proof.
+From ``MANY`` tests on, tests are independent draws: these meet one part of ``TESTS`` with a probability of 95 %.
 """
 
 from __future__ import annotations
@@ -38,10 +29,7 @@ DRAWN: tuple[Origin, ...] = ("iid", "spread")  # origins of tests: independent d
 def share_missed(spread: int, independent: int, dimension: int, confidence: float) -> float:
     """Return the share of tasks that so many tests meet with a probability of at least ``confidence``, at any time.
 
-    Args:
-        spread: the number of points of hypercubes, one after the other, of which only the last may be incomplete.
-        independent: the number of independent draws.
-        dimension: the number of task parameters, which are uniform.
+    The ``spread`` ones are points of hypercubes, one after the other, of which only the last may be incomplete.
     """
     low, high = 0.0, 1.0  # shares of the tasks that are not missed with certainty, and with this probability
     for _ in range(60):

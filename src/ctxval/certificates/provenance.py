@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ctxval._util.representation import ShortRepr
-from ctxval.certificates.base import Certificate
 from ctxval.certificates.bounds import Quantities
 from ctxval.certificates.dynamics_evidence import LearnedDistance
-from ctxval.certificates.sentences import verdicts as sentences
 from ctxval.certificates.sentences import withdrawals
 from ctxval.core.space import DISTRIBUTION, TaskSpace
 from ctxval.core.task_distribution import distribution_text
@@ -37,17 +35,12 @@ class Provenance(ShortRepr):
     """Facts on a campaign, besides its trials, that concern a certificate."""
 
     space: TaskSpace | None = None  #: the task space, to state lengths in its units; None if it is not known
-    #: sentences that a certificate lists among its assumptions, such as what was changed on the system
-    remarks: tuple[str, ...] = ()
-    #: what the experiment's model predicts, for kinds that need it; None if the experiment is not loaded
-    learned: LearnedDistance | None = None
+    remarks: tuple[str, ...] = ()  #: assumptions of certificates, such as what was changed on the system
+    learned: LearnedDistance | None = None  #: what the experiment's model predicts; None if it is not loaded
     distribution: str | None = None  #: the distribution of tasks as a text; None if it is uniform
     units: str = ""  #: the units of the distance
-    #: the largest offset of the start of an execution, as the distance measures it, and as a text; None if executions
-    #: were not recorded
-    start: tuple[float, str] | None = None
-    #: the thresholds in the order in which they were first stated; None if nobody has recorded them
-    thresholds: tuple[StatedThreshold, ...] | None = None
+    start: tuple[float, str] | None = None  #: largest offset of a start, by the distance and as a text; None: unknown
+    thresholds: tuple[StatedThreshold, ...] | None = None  #: in the order of being stated; None if nobody recorded them
     beside: tuple[Neighbour, ...] = ()  #: the other stores of the same experiment beside this one
 
     @classmethod
@@ -66,7 +59,6 @@ class Provenance(ShortRepr):
         match description:
             case {"validation": {"model": {"type": "Refined"}}}:
                 remarks.append(withdrawals.REFINED)
-        distribution = described.get(DISTRIBUTION)
         for change in changes:
             if change.what == "accepted":
                 different = "; ".join(change.content.get("differences", [])[:1]) or "nothing that is described"
@@ -77,22 +69,10 @@ class Provenance(ShortRepr):
             elif change.what == "replaced":
                 numbers = ", ".join(change.content.get("before", {}))
                 remarks.append(withdrawals.REPLACED.format(numbers=numbers, why=change.why))
-        return cls(
-            space=_space_of(described),
-            remarks=tuple(remarks),
-            distribution=None if distribution is None else distribution_text(distribution),
-            thresholds=thresholds,
-            beside=tuple(beside),
-        )
-
-    def caution(self, threshold: float) -> str:
-        """Return what speaks against any answer, each as a sentence after a space; empty if nothing does."""
-        above = [(other.path.name, other.worst) for other in self.beside if other.worst and other.falsifies(threshold)]
-        caution = sentences.falsified_beside(above, threshold, self.quantities)
-        if self.start is not None and self.start[0] > threshold:
-            limit = self.quantities.of(f"{threshold:.6g}")
-            caution += f" The start of an execution was off by {self.start[1]}; the threshold is {limit}."
-        return caution
+        shares = described.get(DISTRIBUTION)
+        stated = None if shares is None else distribution_text(shares)
+        others = tuple(beside)
+        return cls(_space_of(described), tuple(remarks), None, stated, thresholds=thresholds, beside=others)
 
     def known_before(self, threshold: float, trials: Sequence[Trial]) -> int:
         """Return how many distances were known when a threshold was first stated; 0 if no thresholds were recorded."""
@@ -101,28 +81,10 @@ class Provenance(ShortRepr):
         first = (stated.distances for stated in self.thresholds if stated.threshold == threshold)
         return next(first, sum(trial.distance is not None for trial in trials))
 
-    def looked(self, certificate: Certificate, threshold: float, trials: Sequence[Trial], volume: float = 0.0) -> str:
-        """Return, as the end of a sentence, whether a validated threshold was chosen after looking; empty if not."""
-        stated = [each.threshold for each in self.thresholds or ()]
-        before = stated[: stated.index(threshold)] if threshold in stated else stated
-        smaller = sorted(each for each in before if each < threshold and not certificate.covers(each, volume))
-        largest = max((trial.distance or 0.0 for trial in trials), default=0.0)
-        return sentences.looked(self.known_before(threshold, trials), smaller, largest, self.quantities)
-
-    def alone(self, threshold: float, trials: Sequence[Trial]) -> list[str]:
-        """Return what a validation rests on besides its certificate: that neither tau nor the campaign was selected."""
-        falsifying = [other.path.name for other in self.beside if other.falsifies(threshold)]
-        return sentences.not_selected(self.known_before(threshold, trials), len(self.beside), falsifying)
-
     @property
     def quantities(self) -> Quantities:
         """The units and tasks of sentences."""
         return Quantities(self.units, self.space)
-
-    @property
-    def stated(self) -> tuple[str, ...]:
-        """The remarks that are the user's word, on which a validation rests."""
-        return tuple(remark for remark in self.remarks if remark != withdrawals.REFINED)
 
 
 def _space_of(described: Mapping[str, Any]) -> TaskSpace | None:

@@ -43,10 +43,8 @@ class Sample(ShortRepr):
     #: for each trial, the total number of independent draws that was planned when it was drawn; 0 if they were to end
     #: with the verdict, None if that is not known
     planned: Sequence[int | None] = ()
-    #: failures that are left out, because their tasks were executed with success later
-    made_good: tuple[MadeGood, ...] = ()
-    #: what the experiment's model predicts; None if the experiment is not loaded
-    learned: LearnedDistance | None = None
+    made_good: tuple[MadeGood, ...] = ()  #: left-out failures whose tasks were executed later
+    learned: LearnedDistance | None = None  #: what the experiment's model predicts; None if it is not loaded
     distribution: str | None = None  #: the distribution of tasks as a text; None if it is uniform
     suite: Array | None = None  #: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box
     threshold: float | None = None  #: the threshold that is to be decided; None if there is none
@@ -169,10 +167,7 @@ class Sample(ShortRepr):
         return [number for number, each in zip(self.numbers, self.states, strict=True) if each == state]
 
     def differing(self, tolerance: float) -> tuple[int, int] | None:
-        """Return the rows of two executions of one task whose distances differ by more than a tolerance, or None.
-
-        These are the first execution of a task, and the one that differs most from it.
-        """
+        """Return the rows of the first execution of a task and of the one most unlike it, beyond a tolerance."""
         _, firsts, tasks = np.unique(self.points, axis=0, return_index=True, return_inverse=True)
         first_of = firsts[tasks.ravel()]
         differences = np.nan_to_num(np.abs(self.distances - self.distances[first_of]), nan=0.0, posinf=0.0)
@@ -187,12 +182,8 @@ class Sample(ShortRepr):
     @property
     def failures(self) -> dict[str, list[Any]]:
         """The trials that failed, that could not be measured and that were made good, ready for JSON."""
-        made_good = [asdict(failure) for failure in self.made_good]
-        return {
-            "failed": self.numbers_of("failed"),
-            "unmeasured": self.numbers_of("unmeasured"),
-            "made_good": made_good,
-        }
+        failed, unmeasured = self.numbers_of("failed"), self.numbers_of("unmeasured")
+        return {"failed": failed, "unmeasured": unmeasured, "made_good": [asdict(each) for each in self.made_good]}
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -241,10 +232,7 @@ def advice_to_remeasure(sample: Sample) -> str:
 
 
 def without_success(trials: Sequence[Trial]) -> list[Trial]:
-    """Return the trials without a distance whose task was not executed with success later.
-
-    A failure that a later success made good may have been a fault, which is no property of the system.
-    """
+    """Return the trials without a distance whose task was not executed with success later."""
     unknown = (trial for trial in trials if trial.distance is None and trial.state != "open")
     return [each for each in unknown if all(other.number < each.number for other in executions_of(each, trials))]
 

@@ -8,6 +8,7 @@ wrong.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,10 +30,8 @@ from ctxval.errors import CertificateError
 class StoppingDecision(ShortRepr):
     """Whether a campaign stops, and the next task that the rule asks for."""
 
-    #: whether it stops: the verdict is reached, or will be reached if the open trials show nothing new
-    decided: bool = False
-    #: the point of the unit cube ``(d,)`` to execute next; None if the search chooses the next task
-    next_point: Array | None = None
+    decided: bool = False  #: whether it stops: the verdict is reached, or will be if the open trials show nothing new
+    next_point: Array | None = None  #: the point of the unit cube ``(d,)`` to execute next; None if the search chooses
 
 
 _SCREENINGS = ((8, 0.3), (32, 0.05))
@@ -83,10 +82,9 @@ class StoppingRule(ShortRepr):
         points = np.array([trial.unit_point for trial in trials])
         if not trials or covering(points, self.resolution, 0) is None:
             return False
-        try:
+        with suppress(CertificateError):
             return self._is_kept(_ended(trials))[1]
-        except CertificateError:
-            return False
+        return False
 
     def _is_kept(self, sample: Sample) -> tuple[Maxima, bool]:
         drawn = settle_maxima(sample, self.threshold, self.confidence)

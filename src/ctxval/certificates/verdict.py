@@ -35,12 +35,9 @@ class Verdict:
     reason: str  #: the reason for the answer, in one or two sentences
     witness: Trial | None = None  #: the executed trial with d(p) > tau of a falsification; else None
     certificate: Certificate | None = None  #: the certificate that validates or does not suffice; None if there is none
-    #: a forecast of further executions; None if the answer is decided or nothing can be predicted
-    expected: Forecast | None = None
-    #: the evidence for a validation, its conditions, and what holds without them; else None
-    rests_on: str | None = None
-    #: the parameters of the task to execute next, if learned dynamics choose it to decide; else None
-    next_task: Mapping[str, Any] | None = None
+    expected: Forecast | None = None  #: a forecast of further executions; None if nothing can be predicted
+    rests_on: str | None = None  #: the evidence for a validation, its conditions, and what holds without; else None
+    next_task: Mapping[str, Any] | None = None  #: the task to execute next, if learned dynamics choose it; else None
 
     @property
     def bound(self) -> float | None:
@@ -79,9 +76,8 @@ def counterexample(
 ) -> Verdict | None:
     """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it.
 
-    Of a failed execution, the distance of the steps before the failure counts, but less than that of whole executions.
-
-    With noise, a single one does not suffice (:mod:`ctxval.certificates.bets`), except in a suite, executed once.
+    The distance of the steps before a failure counts, but less than that of whole executions. With noise, a single one
+    does not suffice (:mod:`ctxval.certificates.bets`), except in a suite, executed once.
     """
     once = quantities.space is not None and quantities.space.members is not None
     tau, bets = float(threshold), None if once else bets_against(trials, float(threshold), quantile)
@@ -121,9 +117,8 @@ def judge_by(
         why_not = sentences.undecided(certificate, tau, volume, quantities)
         return Verdict("undecided", tau, why_not, certificate=certificate, expected=certificate.expected)
     conditions = (kind or by_name).rests_on(certificate, known.space)
-    alone = known.alone(tau, trials)
-    rests_on = sentences.rests_on(conditions, certificate, tau, quantities, known.stated, alone)
-    looked = known.looked(certificate, tau, trials, volume)
+    rests_on = sentences.rests_on(conditions, certificate, tau, known, trials)
+    looked = sentences.looked(known, certificate, tau, trials, volume)
     reason = f"{sentences.validated(certificate, tau, quantities).removesuffix('.')}{looked}."
     return Verdict("validated", tau, reason, certificate=certificate, rests_on=rests_on)
 
@@ -135,13 +130,9 @@ def judge(
     options: CertificateOptions | None = None,
     provenance: Provenance | None = None,
 ) -> Verdict:
-    """Return the verdict by an executed counterexample, or by the certificate that the options ask for.
+    """Return the verdict by an executed counterexample, or by the certificate of the options; by default, of ``auto``.
 
-    Args:
-        trials: all trials of the campaign.
-        threshold: tau, in the distance's units.
-        options: ``auto`` by default. If the theory of the certificate refuses the trials, the verdict is undecided.
-        provenance: what is known besides the trials.
+    All trials of the campaign are given. If the theory of the certificate refuses them, the verdict is undecided.
     """
     known, chosen = provenance or Provenance(), options or CertificateOptions()
     quantile = chosen.kind.quantile
@@ -157,7 +148,7 @@ def judge(
     if verdict.answer != "falsified" and bets is not None and bets.above:
         parts.append(sentences.noise_may_explain(bets, float(threshold), known.quantities))
     reason = "; ".join(str(part) for part in parts if part is not None)
-    return replace(verdict, reason=f"{reason}.{known.caution(threshold)}")
+    return replace(verdict, reason=f"{reason}.{sentences.caution(known, threshold)}")
 
 
 def _certified(
@@ -165,11 +156,9 @@ def _certified(
 ) -> Certificate:
     """Return a certificate, for a threshold if there is one. Most kinds see countable draws only."""
     suite = None if known.space is None else known.space.members
-    sample = replace(
-        Sample.of(trials, known.learned), distribution=known.distribution, suite=suite, threshold=threshold
-    )
-    kind = options.kind
-    if sample.suite is not None:
+    sample, kind = Sample.of(trials, known.learned), options.kind
+    sample = replace(sample, distribution=known.distribution, suite=suite, threshold=threshold)
+    if suite is not None:
         require_suite(kind)
     # No statement may count draws whose number depended on their distances.
     sample = sample if kind.sorts_draws else sample.with_countable_draws()
@@ -222,14 +211,13 @@ def assess(
     falsified = None
     if threshold is not None:
         falsified = counterexample(trials, threshold, known.quantities, options.confidence, kind.quantile)
-    if threshold is not None and falsified is None:
-        verdict = judge(trials, threshold, options, known)
-        if verdict.certificate is None:
-            raise CertificateError(verdict.reason)
-        return Assessment(kind.name, verdict.certificate, verdict)
-    limit = threshold if kind.uses_threshold else None
+        if falsified is None:
+            verdict = judge(trials, threshold, options, known)
+            if verdict.certificate is None:
+                raise CertificateError(verdict.reason)
+            return Assessment(kind.name, verdict.certificate, verdict)
     try:
-        certificate = _certified(trials, options, known, limit)
+        certificate = _certified(trials, options, known, threshold if kind.uses_threshold else None)
     except CertificateError as error:
         if falsified is None:
             raise

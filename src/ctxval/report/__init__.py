@@ -52,11 +52,9 @@ def write(
     certificate: CertificateOptions | None = None,
     sections: Sequence[Section] = (),
 ) -> Path:
-    """Write the report of a campaign as one HTML file, and return its path. Its system is not executed.
+    """Write the report of a campaign as one HTML file at a path, and return the path. Its system is not executed.
 
     Args:
-        campaign: the campaign.
-        path: the file to write.
         threshold: tau, for the verdict; without it and without ``verdict`` there is no verdict.
         verdict: the verdict, if it was computed before.
         certificate: the kind and the options of the certificate, as in :meth:`ctxval.Campaign.verdict`.

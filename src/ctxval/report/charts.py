@@ -233,14 +233,11 @@ def _legend(named: dict[str, Markup]) -> Markup | None:
 
 
 def data_uri(values: Array, low: float, high: float) -> str:
-    """Return a picture of values ``(rows, columns)`` as a data URI, the first row at the bottom.
-
-    The colours are those of cividis, which is the same for people with and without colour blindness, and whose
-    brightness grows with the value.
-    """
+    """Return a picture of values ``(rows, columns)``, the first row at the bottom, as a data URI."""
     from matplotlib.image import imsave  # imported here: loading it takes longer than a short campaign
 
     buffer = io.BytesIO()
+    # Cividis is the same for people with and without colour blindness.
     imsave(buffer, values, vmin=low, vmax=high, cmap="cividis", origin="lower", format="png")
     return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
 

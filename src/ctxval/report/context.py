@@ -55,8 +55,7 @@ class ReportContext(ShortRepr):
     trials: tuple[Trial, ...]  #: all trials, in the order of asking
     store: Store
     verdict: Verdict | None = None  #: the verdict; None if there is no threshold
-    #: the map p -> d(p), which is never executed; None if the experiment is not loaded
-    validation: Validation | None = None
+    validation: Validation | None = None  #: the map p -> d(p), which is never executed; None if it is not loaded
     dynamics: CampaignDynamics | None = None  #: what the campaign has learned; None if the experiment is not loaded
     missing: str = ""  #: why the experiment is not loaded, as a sentence; empty if it is
     labels: Labels = field(default_factory=Labels)

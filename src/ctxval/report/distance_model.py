@@ -80,10 +80,7 @@ class DistanceModel:
 
     @functools.cached_property
     def sensitivity(self) -> Array:
-        """Total Sobol index of each parameter ``(d,)``: its share in the variance of the predicted distance.
-
-        It includes the interactions of the parameter with others, so that the indices may sum to more than 1.
-        """
+        """Total Sobol index of each parameter ``(d,)``: its share, with interactions, in the variance."""
         d = self.points.shape[1]
         if d == 1:
             return np.ones(1)

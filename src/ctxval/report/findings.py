@@ -173,12 +173,12 @@ def predictions_held(context: ReportContext) -> Answer | None:
         return None
     size = max(float(context.distances.max()), context.bound or 0.0)
     held = sum(agrees(distance_of(trial), prediction.median, size) for trial, prediction in predicted)
+    made, within = len(predicted), quantity(ACCURATE * size, context.labels.units)
     text = (
-        f"{held} of {counted(len(predicted), 'execution')} that were predicted beforehand came out within "
-        f"{quantity(ACCURATE * size, context.labels.units)} of the prediction, which is {percent(ACCURATE)} of the "
-        "largest distance or of the bound."
+        f"{held} of {counted(made, 'execution')} that were predicted beforehand came out within {within} of the "
+        f"prediction, which is {percent(ACCURATE)} of the largest distance or of the bound."
     )
-    return "good" if held == len(predicted) else "attention", text, {"made": len(predicted), "held": held}
+    return "good" if held == made else "attention", text, {"made": made, "held": held}
 
 
 def states_covered(context: ReportContext) -> Answer | None:
@@ -207,26 +207,21 @@ DIAGNOSTICS: dict[str, Question] = {
 
 def not_tested(context: ReportContext) -> list[str]:
     """Return what was not tested, one sentence each."""
-    sentences = []
-    certificate = context.certificate
+    sentences, certificate = list[str](), context.certificate
     if certificate is not None and certificate.volume:
         left_out = at_most(100 * certificate.volume, 3)
         sentences.append(f"The certificate leaves out {left_out} % {of_tasks(certificate.distribution)}.")
     if context.suite is not None:
-        left = context.suite.remaining(context.points)
-        if len(left):
+        if len(left := context.suite.remaining(context.points)):
             names = enumerated(map(context.suite.name_at, left), 20)
             sentences.append(f"Tasks of the suite without a distance: {names}.")
     elif len(context.points):
         share, d = share_far_from_trials(context.points), context.space.dimension
         if share:
-            sentences.append(
-                f"{percent(share)} of the task space is farther than {RESOLUTION:g} diagonals from every trial; there "
-                "the distance is inferred and not executed."
-            )
-        bare = len(bare_corners(context.points, RESOLUTION))
-        where = "ends of the range" if d == 1 else "corners of the task space"
-        if bare:
+            far = f"{percent(share)} of the task space is farther than {RESOLUTION:g} diagonals from every trial"
+            sentences.append(f"{far}; there the distance is inferred and not executed.")
+        if bare := len(bare_corners(context.points, RESOLUTION)):
+            where = "ends of the range" if d == 1 else "corners of the task space"
             sentences.append(f"{bare} of the {2**d} {where} have no trial next to them.")
     for trial in context.failed[:10]:
         values = zip(context.task_labels, context.tasks_of([trial])[0], strict=True)

@@ -120,22 +120,20 @@ def explained(context: ReportContext) -> Answer | None:
     executed, predicted = np.array(pairs).T
     size = float(np.sqrt((executed**2).mean()))
     error = float(np.sqrt(((executed - predicted) ** 2).mean()))
-    share = 1 - error / max(size, 1e-300)
+    left = error / max(size, 1e-300)
+    share = 1 - left
     numbers = {"share_explained": share, "error": error, "trials": len(pairs)}
     text = (
         f"M with a residual that is learned from the other trials predicts the distances of {len(pairs)} trials with "
-        f"an error of {quantity(error, context.labels.units)} (root mean square), "
-        f"{percent(error / max(size, 1e-300))} of the distances."
+        f"an error of {quantity(error, context.labels.units)} (root mean square), {percent(left)} of the distances."
     )
     of = "the recorded state" if context.validation.outputs is None else state_of(estimated=True)
-    text += (
-        f" It explains the distance: the difference is a function of {of} and input, and a model that is fitted to "
-        "these data can remove it."
-        if share >= 0.8
-        else " It does not explain the distance: a state that is not recorded, a contact, dry friction or noise is the "
-        "likely cause, or too few trials."
-    )
-    return "good" if share >= 0.8 else "attention", text, numbers
+    if share >= 0.8:
+        difference = f"the difference is a function of {of} and input"
+        fitted = "a model that is fitted to these data can remove it"
+        return "good", f"{text} It explains the distance: {difference}, and {fitted}.", numbers
+    causes = "a state that is not recorded, a contact, dry friction or noise is the likely cause, or too few trials"
+    return "attention", f"{text} It does not explain the distance: {causes}.", numbers
 
 
 def components(context: ReportContext) -> Answer | None:
@@ -206,9 +204,9 @@ def unusual_motion(context: ReportContext) -> Answer | None:
     ratios = sizes[:_WORST] / usual
     row, j = (int(k) for k in np.unravel_index(int(ratios.argmax()), ratios.shape))
     trial, label, ratio = list(context.recordings)[row], context.signals[0][j], float(ratios[row, j])
-    values = {"trial": trial, "state": label, "times_the_median": ratio}
     if ratio < 3.0:
         return None
+    values = {"trial": trial, "state": label, "times_the_median": ratio}
     text = (
         f"In trial {trial} M itself moves {number(float(sizes[row, j]))} in {label}, {number(ratio, 2)} times as far "
         "as in the median trial: the controller asks for an unusual motion, which may explain the distance better "
@@ -226,10 +224,8 @@ def saturation(context: ReportContext) -> Answer | None:
     j = int(limits.shares.argmax())
     label, share = context.signals[1][j], float(limits.shares[j])
     values = {"input": label, "share_of_steps": share, "limits_known": limits.known}
-    text = f"{label} is at its limit in {percent(share)} of all steps" + (
-        "." if limits.known else " (the limits are taken from the records, in which the extreme value repeats)."
-    )
-    return "attention", text, values
+    guess = "" if limits.known else " (the limits are taken from the records, in which the extreme value repeats)"
+    return "attention", f"{label} is at its limit in {percent(share)} of all steps{guess}.", values
 
 
 def converged(context: ReportContext) -> Answer | None:

@@ -58,13 +58,10 @@ def sentence(words: str) -> str:
 
 
 def element(name: str, /, *children: object, **attributes: object) -> Markup:
-    """Return one element.
+    """Return one element with children: elements, or texts that are escaped; None is left out.
 
-    Args:
-        name: the name of the element.
-        children: elements, or texts that are escaped; None is left out.
-        attributes: its attributes. An underscore is a hyphen, and one at the end is dropped: ``class_``. An attribute
-            that is None is left out, and one that is True has no value.
+    An underscore in an attribute is a hyphen, and one at the end is dropped: ``class_``. An attribute that is None is
+    left out, and one that is True has no value.
     """
     given = Markup("")
     for key, value in attributes.items():

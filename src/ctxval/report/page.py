@@ -97,12 +97,10 @@ def framed(
 
     A section that fails says why, and the others are shown; ``folded`` folds all but the first one.
     """
-    style, script = (
-        (files("ctxval.report") / "assets" / name).read_text("utf-8") for name in ("report.css", "report.js")
-    )
-    of_script, of_style = (
-        base64.b64encode(hashlib.sha256(asset.encode()).digest()).decode() for asset in (script, style)
-    )
+    assets = files("ctxval.report") / "assets"
+    style, script = ((assets / name).read_text("utf-8") for name in ("report.css", "report.js"))
+    digests = (hashlib.sha256(asset.encode()).digest() for asset in (script, style))
+    of_script, of_style = (base64.b64encode(digest).decode() for digest in digests)
     # Nothing but the style and the script of this page runs, and only data images are shown.
     policy = (
         f"default-src 'none'; script-src 'sha256-{of_script}'; style-src 'sha256-{of_style}'; img-src data:; "
@@ -139,11 +137,8 @@ def _section(number: int, title: str, render: Callable[[], object], *, folded: b
     shown = content if hasattr(content, "__html__") else paragraph(str(content))
     first, label = folded and number == 1, f"heading-{number}"
     head = element("h2", text(title, 200), id=label, class_="hidden" if first else None)
-    inside = (
-        joined([head, shown])
-        if first
-        else element("details", element("summary", head), shown, open=None if folded else True)
-    )
+    folds = element("details", element("summary", head), shown, open=None if folded else True)
+    inside = joined([head, shown]) if first else folds
     return element("section", inside, id=f"section-{number}", aria_labelledby=label)
 
 
@@ -230,10 +225,8 @@ def markdown(context: ReportContext) -> str:
         values = (value if isinstance(value, str) else number(value) for value in task)
         cells = (str(trial.number), quantity(distance_of(trial), units), *values)
         rows.append(f"| {' | '.join(map(markdown_text, cells))} |")
-    entries = [
-        f"- **{markdown_text(entry.term)}** ({entry.standard}): {markdown_text(entry.content, UNCUT)}"
-        for entry in repeat.appendix(context)
-    ]
+    appendix = ((markdown_text(entry.term), entry.standard, entry.content) for entry in repeat.appendix(context))
+    entries = [f"- **{term}** ({standard}): {markdown_text(words, UNCUT)}" for term, standard, words in appendix]
 
     def items(findings: list[Finding]) -> list[str]:
         texts = ((WORDS[each.light], markdown_text(each.name), markdown_text(each.text)) for each in findings)

@@ -66,11 +66,10 @@ def _regions(report: ReplayReport) -> Markup:
     if not report.regions:
         return paragraph("There are too few recorded steps to divide them into regions.")
     names = list(dict.fromkeys(region.variable for region in report.regions))
-    rows = [
-        (*labels_of({region.variable: region.unit}), f"{number(region.low)} to {number(region.high)}", region.count,
-         region.ratio)
-        for region in report.regions
-    ]  # fmt: skip
+    rows = []
+    for region in report.regions:
+        (label,), between = labels_of({region.variable: region.unit}), f"{number(region.low)} to {number(region.high)}"
+        rows.append((label, between, region.count, region.ratio))
     headers = ("State or input", "Between", "Steps", "Error, as a multiple of the average")
     meaning = (
         "Each state and input is divided into ranges with equally many steps. The error is that of one step over all "
@@ -114,15 +113,9 @@ def _tasks(tasks: PredictedTasks, units: str) -> Markup:
     axes = Axis("task in the table below", 0.5, len(tasks.worst) + 0.5), Axis.over(label, high, zero=True)
     chart = Chart("Predicted distances of the worst tasks, with 90 % of the samples", *axes)
     chart.whiskers(numbers, low, high, "corrected").marks(numbers, median, "corrected", "predicted")
-    return joined(
-        [
-            paragraph(bound),
-            *([paragraph(left)] if tasks.unplanned else []),
-            chart,
-            _task_table("Tasks with the largest predicted distances", tasks.worst, units),
-            _task_table("Executions that would tell most of the largest distance", tasks.executions, units),
-        ]
-    )
+    worst = _task_table("Tasks with the largest predicted distances", tasks.worst, units)
+    telling = _task_table("Executions that would tell most of the largest distance", tasks.executions, units)
+    return joined([paragraph(bound), *([paragraph(left)] if tasks.unplanned else []), chart, worst, telling])
 
 
 def _task_table(caption: str, tasks: Sequence[PredictedTask], units: str) -> Markup:
@@ -149,11 +142,10 @@ def _recordings(report: ReplayReport) -> Markup:
         ("Inputs", ", ".join(labels_of(data.inputs)) or "none"),
         ("Recordings that the model was learned from", data.seen),
     ]
-    folded = [("source", list(data.sources)), ("split", [str(gap) for gap in data.breaks])]
     parts = [table("The recordings", ("Quantity", "Value"), rows, class_="facts")]
     if data.notes:
         parts += [paragraph("How they were read:"), bullets(f"{sentence(words)}." for words in data.notes)]
-    for name, lines in folded:
+    for name, lines in ("source", list(data.sources)), ("split", [str(gap) for gap in data.breaks]):
         more = [f"and {len(lines) - 20} others; --json lists them"] if len(lines) > 20 else []
         if lines:
             parts.append(details(counted(len(lines), name), bullets([*lines[:20], *more])))
@@ -162,9 +154,8 @@ def _recordings(report: ReplayReport) -> Markup:
 
 def _error_chart(errors: Sequence[StepError]) -> Chart:
     steps = np.array([float(error.steps) for error in errors])
-    rms, low, high, change = (
-        np.array([getattr(error, k) for error in errors]) for k in ("rms", "lowest", "highest", "change")
-    )
+    names = ("rms", "lowest", "highest", "change")
+    rms, low, high, change = (np.array([getattr(error, name) for error in errors]) for name in names)
     first = errors[0]
     (label,) = labels_of({first.state: first.unit})
     x, y = Axis.over("steps", steps, room=0.03), Axis.over(label, high, rms, zero=True)

@@ -80,7 +80,6 @@ class PageRoutes:
         return self._with_cookie(page, self.access.new_session()[1])
 
     def _message(self, title: str, sentence: str, status: int = 404, *, forward: bool = False) -> Response:
-        """Return a page with one sentence, and a link to the campaign; ``forward`` follows the link at once."""
         page = self.page.render("message.html", title=title, sentence=sentence, forward=forward)
         return HTMLResponse(page, status)
 
@@ -91,8 +90,8 @@ class PageRoutes:
     def _inside(self, handler: Handler) -> Callable[[Request], Awaitable[Response]]:
         """Return a handler that is called with the name of the session.
 
-        A browser that needs no token gets a new session. The token of a form cannot be one of that session, so the form
-        is refused with its fields kept: the page was open while the server was started again.
+        A browser that needs no token gets a new session. If the page was open while the server was started again, the
+        token of its form is not one of that session, so the form is refused with its fields kept.
         """
 
         async def handle(request: Request) -> Response:
@@ -200,7 +199,6 @@ class OperatorPage(PageRoutes):
                 raise InputError(str(error).replace(f"{folder}/", "")) from error
 
     async def _file(self, request: Request, session: str) -> Response:
-        """Return one file of an open trial, or all of them in one archive."""
         number, name = request.path_params["number"], request.path_params.get("name")
         try:
             files = await self.service.files_of(number)
@@ -252,8 +250,7 @@ def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
             space.point(named)
             return TaskRequest(named, trials=seen)
         case "own":
-            names = zip(space.names, range(space.dimension), strict=True)
-            point = np.array([_number(fields, f"parameter-{place}", name) for name, place in names])
+            point = np.array([_number(fields, f"parameter-{place}", name) for place, name in enumerate(space.names)])
             parameters = space.describe_point(point)
             space.point(parameters)
             return TaskRequest(parameters, trials=seen)
@@ -274,12 +271,11 @@ def result(kind: str, fields: Fields, recording: Path | None) -> SuppliedResult:
         return SuppliedResult(distance=_number(fields, "distance", "the distance"), replace=replace)
     if recording is None:
         raise InputError("choose the file of the recording.")
-    tolerance = _number(fields, "tolerance", "the start tolerance") if fields.get("tolerance", "").strip() else None
-    require("the start tolerance", NonNegativeFloat | None, tolerance)
-    resample = "resample" in fields
-    failed = fields.get("reason", "").strip() or None
+    start = _number(fields, "tolerance", "the start tolerance") if fields.get("tolerance", "").strip() else None
+    require("the start tolerance", NonNegativeFloat | None, start)
+    resample, failed = "resample" in fields, fields.get("reason", "").strip() or None
     return SuppliedResult(
-        recording, failed=failed, resample=resample, start_tolerance=tolerance, replace=replace, uploaded=True
+        recording, failed=failed, resample=resample, start_tolerance=start, replace=replace, uploaded=True
     )
 
 

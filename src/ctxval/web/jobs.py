@@ -41,7 +41,6 @@ class Snapshot:
 
     @property
     def waiting(self) -> list[Trial]:
-        """The open trials, which people execute, or which a program is executing."""
         return [trial for trial in self.trials if trial.state == "open"]
 
     @property
@@ -162,8 +161,7 @@ def _files(served: ServedCampaign, opened: OpenTrial) -> Files:
 def judge(served: ServedCampaign) -> Verdict | None:
     """Return the verdict on the trials that have ended; None if there is no threshold.
 
-    A certificate refuses open trials, because somebody may have left open what failed. At a rig a trial is nearly
-    always open, so the page judges the others, and says which ones do not count.
+    At a rig a trial is nearly always open, which a certificate refuses, so the page says which trials do not count.
     """
     if served.threshold is None:
         return None

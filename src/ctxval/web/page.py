@@ -65,7 +65,6 @@ class Page:
         replaced: int | None = None,
         all_: bool,
     ) -> str:
-        """Return the page of the campaign, with the forms of a trial whose result is to be replaced."""
         state, snapshot, space = self._state, self._state.snapshot, self._space
         certificate = state.certificate if state.verdict is None else state.verdict.certificate
         images = {name: data for name, data in state.pictures.items() if isinstance(data, bytes)}
@@ -97,7 +96,6 @@ class Page:
         return self._templates.get_template(name).render(**values)
 
     def _open_trial(self, trial: Trial) -> dict[str, Any]:
-        """Return what the page shows of an open trial; a program executes it if it has attempts."""
         prepared = self._state.files.get(trial.number)
         files: Files = prepared if isinstance(prepared, dict) else {}
         # The model's trajectory has the columns that a recording must have.
@@ -154,7 +152,6 @@ _SEARCHES = {
 
 
 def why(trial: Trial, units: str) -> list[str]:
-    """Return sentences on the reason why the task of a trial was chosen, and on the prediction of its execution."""
     note = trial.note or {}
     sentences, expected = [_ORIGINS[trial.origin]], note.get("expected")
     if trial.origin == "acquisition" and isinstance(expected, int | float) and abs(expected) < math.inf:

@@ -39,10 +39,7 @@ HEADERS = {
 
 
 class Access:
-    """Who may use the page: the token of the server, sessions in signed cookies, and tokens of forms.
-
-    Without a token, every browser on this computer is admitted.
-    """
+    """Who may use the page: the token of the server, if it has one, sessions in cookies, and tokens of forms."""
 
     def __init__(self, token: str | None, port: int) -> None:
         if token is not None and (len(token) < 16 or not (token.isascii() and token.isprintable())):
@@ -114,7 +111,6 @@ def is_address(host: str) -> bool:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only programs on this computer reach a host."""
     return host == "localhost" or (is_address(host) and ipaddress.ip_address(host.partition("%")[0]).is_loopback)
 
 

@@ -125,7 +125,6 @@ class Waiting:
         self._ends: dict[Connection, asyncio.TimerHandle] = {}
 
     def add(self, connection: Connection) -> None:
-        """Let a connection wait, from now on."""
         self.remove(connection)
         self._ends[connection] = connection.loop.call_later(10.0, connection.transport.abort)
         if len(self._ends) > 128:
@@ -142,10 +141,7 @@ class Waiting:
 
 
 class Connection(H11Protocol):
-    """A connection of the server; h11 limits the size of headers, which httptools does not.
-
-    The application finds it as ``scope["state"]["connection"]``.
-    """
+    """A connection, which the application finds as ``scope["state"]["connection"]``; h11 limits the size of headers."""
 
     def __init__(self, waiting: Waiting, **options: Any) -> None:
         super().__init__(**options)

@@ -101,7 +101,6 @@ class CampaignService(PageState):
             return self.snapshot.trials[number]
 
     async def files_of(self, number: int) -> Files:
-        """Return the files of an open trial, after they are prepared."""
         if number in self._preparing:
             await asyncio.shield(self._preparing[number])
         files = self.files.get(number)
@@ -215,10 +214,7 @@ class BackgroundProcess:
         self._closed = False
 
     def submit(self, job: Callable[..., Any], *arguments: Any) -> cf.Future[Any]:
-        """Do a job after the earlier ones; its future raises a CampaignError if the job fails or the process ends.
-
-        The job is a function of a module, which the child process calls with the served campaign and the arguments.
-        """
+        """Do a job, a function of a module, after the earlier ones; its future raises a CampaignError if this fails."""
         return self._thread.submit(self._do, job, arguments)
 
     def close(self) -> None:

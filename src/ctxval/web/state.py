@@ -41,7 +41,6 @@ class Work:
         return replace(self, progress=progress, reached=self.reached if same else time.monotonic())
 
     def to_json(self) -> dict[str, Any]:
-        """Return the stage in words, how much of it is done, and the whole seconds since the start."""
         now, progress = time.monotonic(), self.progress
         counted = amount(progress, now - self.reached)
         text = f"{progress.stage}, {counted}" if counted else progress.stage
@@ -69,10 +68,7 @@ class Innermost:
 
 
 class PageState:
-    """What the page shows, for any number of browsers. All of it belongs to the event loop of the server.
-
-    Only what does not change of the served campaign may be read here.
-    """
+    """What the page shows; it belongs to the event loop, so only what never changes of a campaign is read here."""
 
     live = False  # whether a command executes the tasks, so that the page only shows them
     choosing: Work | None = None
@@ -109,10 +105,7 @@ class PageState:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def events(self) -> AsyncIterator[str]:
-        """Yield an event with the version of the page after each change, or with the work in progress.
-
-        A comment now and then shows that the connection is there.
-        """
+        """Yield an event with the version of the page after each change, or the work in progress, or a comment."""
         seen = None
         self.listeners += 1
         try:

@@ -99,11 +99,9 @@ def margin_and_map(
     sample: Sample, margin: float, volume: float, total: float, confidence: float, limit: str, kept: str
 ) -> str:
     """Return the statement of a region: the margin of the prediction, and the share of the tasks above a limit."""
-    excess = (
-        f"exceeds the predicted one by at most {at_most(margin)}"
-        if margin >= 0
-        else f"is below the predicted one by at least {at_most(margin).removeprefix('-')}"
-    )
+    excess = f"exceeds the predicted one by at most {at_most(margin)}"
+    if margin < 0:
+        excess = f"is below the predicted one by at least {at_most(margin).removeprefix('-')}"
     return (
         f"With {percent(confidence)} confidence, the distance {excess}, except on at most {at_most(100 * volume, 3)} % "
         f"{of_tasks(sample.distribution)}; {kept}, so that the distance exceeds {limit} on at most "
@@ -118,27 +116,22 @@ def posterior_statement(upper: float, error: float, confidence: float, *, stocha
     """Return the bound on d* from a Gaussian process of the distance."""
     what, bound = "the largest expected distance" if stochastic else "d*", with_error(upper, error)
     remark = " (plus or minus one standard error of the random draws that it is computed from)" if "±" in bound else ""
-    return (
-        f"With {percent(confidence)} probability under a Gaussian process of the distance, given the trials, {what} is "
-        f"at most {bound}{remark}."
-    )
+    given = "under a Gaussian process of the distance, given the trials"
+    return f"With {percent(confidence)} probability {given}, {what} is at most {bound}{remark}."
 
 
 def posterior_assumptions(sample: Sample, used: int, resolution: float, *, stochastic: bool) -> tuple[str, ...]:
     """Return what the posterior bound assumes; the process is conditioned on so many of the trials."""
-    noise = (
-        "executions of one task differ by independent normal noise of one size"
-        if stochastic
-        else "each task has one distance: the system is deterministic"
-    )
+    what, noise = "distance, or its logarithm,", "each task has one distance: the system is deterministic"
+    if stochastic:
+        what, noise = "expected distance", "executions of one task differ by independent normal noise of one size"
     left_out = (
         f"the process is conditioned on {used} of the {len(sample)} trials, the largest distances, the latest and "
         "well-spread ones, because all would take too long; the others would hardly raise the bound",
     )
     return (
-        f"the {'expected distance' if stochastic else 'distance, or its logarithm,'} is a draw from a Gaussian "
-        "process: a constant mean, a Matern kernel of smoothness 3/2 or 5/2, one length-scale for each parameter, all "
-        "of them unknown and integrated over",
+        f"the {what} is a draw from a Gaussian process: a constant mean, a Matern kernel of smoothness 3/2 or 5/2, one "
+        "length-scale for each parameter, all of them unknown and integrated over",
         f"it is as rough in one part of the task space as in another, as far as {resolution:g} of its diagonal from "
         "the trials: a peak in a gap between them, of which no trial shows a trace, is not covered; audit for that",
         noise,
@@ -152,11 +145,9 @@ def both_outcomes(sample: Sample, *, stochastic: bool) -> str | None:
     first = next((success for success in sample.made_good if success.because is None), None)
     if first is None:
         return None
-    what = (
-        "a failure has no distance, so that nothing is known of the expected one there"
-        if stochastic
-        else "the system is not deterministic there"
-    )
+    what = "the system is not deterministic there"
+    if stochastic:
+        what = "a failure has no distance, so that nothing is known of the expected one there"
     return (
         f"trial {first.trial} failed and trial {first.by} executed the same task with success, for no stated reason: "
         f"{what}, and the bound is withdrawn; if the cause was removed in between, execute the task once more and say "
@@ -184,15 +175,11 @@ IRREGULAR = (
 
 def dynamics_statement(upper: float, error: float, confidence: float, quantile: float | None = None) -> str:
     """Return the bound on d*, or on the quantile of the distance at the worst task, from learned dynamics."""
+    bound = f"With {percent(confidence)} probability under a Gaussian process of the residual dynamics"
     if quantile is not None:
-        return (
-            f"With {percent(confidence)} probability under a Gaussian process of the residual dynamics with noise, the "
-            f"{quantile:g} quantile of the distance is at most {with_error(upper, error)} in every task."
-        )
-    return (
-        f"With {percent(confidence)} probability under a Gaussian process of the residual dynamics, d* is at most "
-        f"{with_error(upper, error)}."
-    )
+        which = f"the {quantile:g} quantile of the distance"
+        return f"{bound} with noise, {which} is at most {with_error(upper, error)} in every task."
+    return f"{bound}, d* is at most {with_error(upper, error)}."
 
 
 _WITHOUT_DATA = (
@@ -299,13 +286,10 @@ def conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
 
 def envelope_statement(envelope: Envelope) -> str:
     """Return what an envelope says, why it is not larger, and what nothing has checked."""
-    limit, share = f"{at_most(envelope.threshold)} {envelope.units}".rstrip(), 100 * envelope.share
+    limit = f"{at_most(envelope.threshold)} {envelope.units}".rstrip()
     what = "d" if envelope.quantile is None else f"the {envelope.quantile:g} quantile of d"
-    tasks = f"all tasks of a set of {share:.3g} % of the tasks"
-    if envelope.tasks is not None:
-        tasks = f"all tasks of a set of {len(envelope.tasks)} tasks"
-    if not envelope.share:
-        tasks = "no task that can be named"
+    size = f"{100 * envelope.share:.3g} % of the tasks" if envelope.tasks is None else f"{len(envelope.tasks)} tasks"
+    tasks = f"all tasks of a set of {size}" if envelope.share else "no task that can be named"
     sentences = [f"With {percent(envelope.confidence)} confidence, {what} stays below {limit} on {tasks}."]
     or_irregular = " or come to contacts" if envelope.irregular else ""
     if envelope.uncovered >= 0.005:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,12 +26,13 @@ from ctxval.certificates.covering import RESOLUTION, EmptyBox
 from ctxval.certificates.dynamics_evidence import PushedDistances, Tolerance
 from ctxval.certificates.sample import executions_of
 from ctxval.certificates.sentences.statements import condition_on_dynamics, conditions_on_dynamics
+from ctxval.certificates.sentences.withdrawals import REFINED
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Trial
 
 if TYPE_CHECKING:
     from ctxval.certificates.base import Certificate
-    from ctxval.certificates.forecast import Forecast
+    from ctxval.certificates.provenance import Provenance
 
 # Falsified
 
@@ -77,19 +78,24 @@ def noise_may_explain(bets: Bets, tau: float, quantities: Quantities) -> str:
     )
 
 
-def falsified_beside(executed: Sequence[tuple[str, Trial]], tau: float, quantities: Quantities) -> str:
-    """Return, as a sentence after a space, which trials of other stores exceed a threshold; empty if there are none."""
-    if not executed:
-        return ""
-    first = "Another store of this experiment falsifies"
-    if len(executed) > 1:
-        first = f"{len(executed)} other stores of this experiment falsify"
-    trials = (
-        f"trial {trial.number} of {quoted(name)} has the distance "
-        f"{quantities.of(distinguishable(trial.distance or 0.0, tau)[0])}, at {quantities.task(trial)}"
-        for name, trial in executed[:3]
-    )
-    return f" {first} {quantities.of(f'{tau:.6g}')}: {'; '.join(trials)}{'; ...' if len(executed) > 3 else ''}."
+def caution(known: Provenance, tau: float) -> str:
+    """Return what speaks against any answer, each as a sentence after a space; empty if nothing does."""
+    quantities, caution = known.quantities, ""
+    limit = quantities.of(f"{tau:.6g}")
+    above = [(other.path.name, other.worst) for other in known.beside if other.worst and other.falsifies(tau)]
+    if above:
+        first = "Another store of this experiment falsifies"
+        if len(above) > 1:
+            first = f"{len(above)} other stores of this experiment falsify"
+        trials = (
+            f"trial {trial.number} of {quoted(name)} has the distance "
+            f"{quantities.of(distinguishable(trial.distance or 0.0, tau)[0])}, at {quantities.task(trial)}"
+            for name, trial in above[:3]
+        )
+        caution = f" {first} {limit}: {'; '.join(trials)}{'; ...' if len(above) > 3 else ''}."
+    if known.start is not None and known.start[0] > tau:
+        caution += f" The start of an execution was off by {known.start[1]}; the threshold is {limit}."
+    return caution
 
 
 # Validated
@@ -149,48 +155,59 @@ def _gaps(resolution: Mapping[str, float], quantities: Quantities) -> str:
 
 
 def rests_on(
-    conditions: Sequence[str],
-    certificate: Certificate,
-    tau: float,
-    quantities: Quantities,
-    remarks: Sequence[str],
-    alone: Sequence[str],
+    conditions: Sequence[str], certificate: Certificate, tau: float, known: Provenance, trials: Sequence[Trial]
 ) -> str:
     """Return the evidence of a validation, what it rests on, and what independent draws say without any of it."""
-    parts = list(conditions)
-    made_good = certificate.details.get("failures", {}).get("made_good", [])
+    details, parts = certificate.details, list(conditions)
+    made_good = details.get("failures", {}).get("made_good", [])
     if made_good:
         numbers = ", ".join(str(failure["trial"]) for failure in made_good)
         parts.append(f"your word that what made trial {numbers} fail is removed for good")
-    parts += [*(f"your word that {remark}" for remark in remarks), *alone]
-    trials = evidence(certificate, tau, quantities)
-    return f"{trials}It rests on {'; on '.join(parts)}.{_without_assumptions(certificate, tau, quantities)}"
+    parts += [f"your word that {remark}" for remark in known.remarks if remark != REFINED]
+    parts += _not_selected(known, known.known_before(tau, trials), tau)
+    text = f"{_evidence(certificate, tau, known.quantities)}It rests on {'; on '.join(parts)}."
+    tests = details.get("tests", {})
+    if tests.get("share_missed") is None:
+        return text
+    draws = [f"{counted(tests['spread'], 'test')} drawn as a Latin hypercube"] if tests["spread"] else []
+    draws += [counted(tests["independent"], "independent draw")] if tests["independent"] else []
+    return (
+        f"{text} By these tests alone, whatever the dynamics are: at most {at_most(100 * tests['share_missed'], 2)} % "
+        f"{of_tasks(certificate.distribution)} exceed {known.quantities.of(f'{tau:.6g}')} "
+        f"({' and '.join(draws)}, {percent(certificate.confidence)})."
+    )
 
 
-def evidence(certificate: Certificate, tau: float, quantities: Quantities) -> str:
+def _evidence(certificate: Certificate, tau: float, quantities: Quantities) -> str:
     """Return what speaks for a bound on d*: executions, tests of predictions, and what the bound survives."""
     if certificate.volume or certificate.kind == "suite":
         return ""
-    details = certificate.details
+    details, text = certificate.details, str(counted(certificate.trials, "execution"))
     best, tests, left = details.get("best"), details.get("tests"), details.get("not_executed")
-    largest = "" if best is None else f", the largest distance {quantities.of(f'{best:.4g}')}"
-    tested = ""
+    if best is not None:
+        text += f", the largest distance {quantities.of(f'{best:.4g}')}"
     if tests is not None and tests["drawn"]:
-        tested = f"; {tests['drawn']} of them at tasks drawn over the whole task space"
+        text += f"; {tests['drawn']} of them at tasks drawn over the whole task space"
         if tests["largest_error"] is not None:
             within = at_most(100 * tests["largest_error"] / tau, 2)
-            tested += f", where the predictions made beforehand erred by at most {within} % of the threshold"
-    missing = f"; {left} of the {details['tasks']} tasks were not executed" if left else ""
-    survives = ""
-    if (known := tolerances(certificate, tau)) is not None:
-        everywhere, away = known
-        survives = (
+            text += f", where the predictions made beforehand erred by at most {within} % of the threshold"
+    if left:
+        text += f"; {left} of the {details['tasks']} tasks were not executed"
+    text += "."
+    if (pushes := tolerances(certificate, tau)) is not None:
+        everywhere, away = pushes
+        text += (
             f" The bound would survive a further error of M of {_push(everywhere)} at every step, or of {_push(away)} "
             f"where no record is near; its largest recorded error is {_rate(everywhere.state, everywhere.residual)}."
         )
-    executions = counted(certificate.trials, "execution")
-    least = _not_entered(details.get("pocket")) + _not_tried(details.get("empty_box"), quantities.space)
-    return f"{executions}{largest}{tested}{missing}.{survives}{least} "
+    if (pocket := details.get("pocket")) is not None:
+        text += (
+            f" The least tested place is {with_units(pocket['place'])}: predicted runs lead there, and no execution "
+            f"came within {radius_of(pocket['within'])}."
+        )
+    if (empty := details.get("empty_box")) is not None and quantities.space is not None:
+        text += f" {_not_tried(EmptyBox(**empty), quantities.space)}"
+    return f"{text} "
 
 
 def tolerances(certificate: Certificate, tau: float) -> tuple[Tolerance, Tolerance] | None:
@@ -203,9 +220,8 @@ def tolerances(certificate: Certificate, tau: float) -> tuple[Tolerance, Toleran
 
 
 def _push(tolerance: Tolerance) -> str:
-    if np.isfinite(tolerance.push):
-        return _rate(tolerance.state, tolerance.push)
-    return "more than 8 times the largest residual"
+    finite = np.isfinite(tolerance.push)
+    return _rate(tolerance.state, tolerance.push) if finite else "more than 8 times the largest residual"
 
 
 def _rate(label: str, value: float) -> str:
@@ -213,26 +229,14 @@ def _rate(label: str, value: float) -> str:
     return f"{f'{two_digits(value)} {unit}'.rstrip()} in {name}"
 
 
-def _not_entered(pocket: Mapping[str, Any] | None) -> str:
-    """Return, as a sentence after a space, the largest region of two states that loops enter and no execution has."""
-    if pocket is None:
-        return ""
-    return (
-        f" The least tested place is {with_units(pocket['place'])}: predicted runs lead there, and no execution came "
-        f"within {radius_of(pocket['within'])}."
-    )
-
-
-def _not_tried(empty: Mapping[str, Any] | None, space: TaskSpace | None) -> str:
-    """Return, as a sentence after a space, the largest box of two task parameters without an execution."""
-    if empty is None or space is None:
-        return ""
-    box, low, high = EmptyBox(**empty), space.low, space.high
-    ends = zip(box.parameters, box.low, box.high, strict=True)
-    sides = ((*parted(space.labels[j]), *(low[j] + np.array(side) * (high[j] - low[j])).tolist()) for j, *side in ends)
-    both = " and ".join(f"{name} {first:.3g} to {last:.3g} {unit}".rstrip() for name, unit, first, last in sides)
-    share = 100 * box.share
-    return f" No execution had {both} together ({share:.0f} % of the task space, the largest box of two parameters)."
+def _not_tried(box: EmptyBox, space: TaskSpace) -> str:
+    sides = []
+    for j, *side in zip(box.parameters, box.low, box.high, strict=True):
+        name, unit = parted(space.labels[j])
+        first, last = space.low[j] + np.array(side) * (space.high[j] - space.low[j])
+        sides.append(f"{name} {first:.3g} to {last:.3g} {unit}".rstrip())
+    share = f"{100 * box.share:.0f} % of the task space"
+    return f"No execution had {' and '.join(sides)} together ({share}, the largest box of two parameters)."
 
 
 def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
@@ -246,10 +250,8 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
             where = "" if resolution is None else f"{_gaps(resolution, quantities)} (a peak inside one may be missed)"
             once = "each task having one distance, however often it is executed"
             if details.get("stochastic"):
-                once = (
-                    "the noise being normal and alike everywhere (it is the expected distance that "
-                    "is bounded: single executions may exceed it)"
-                )
+                bounded = "it is the expected distance that is bounded: single executions may exceed it"
+                once = f"the noise being normal and alike everywhere ({bounded})"
             return [f"the distance being as smooth between the trials as at them{where}", once]
         case "suite":
             return ["an execution of a task again giving the distance that was recorded"]
@@ -258,51 +260,45 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
                 "tasks that were drawn independently, and from which M was not learned (how large the distance is in "
                 f"the {at_most(100 * certificate.volume, 3)} % that are left out is not known)"
             )
-            fixed = ["a prediction that was fixed before these tasks were drawn"]
-            return [draws, *(fixed if certificate.kind == "region" else [])]
+            fixed = "a prediction that was fixed before these tasks were drawn"
+            return [draws, fixed] if certificate.kind == "region" else [draws]
     return ["what its certificate assumes"]
 
 
-def looked(known: int, smaller: Sequence[float], largest: float, quantities: Quantities) -> str:
+def looked(known: Provenance, certificate: Certificate, tau: float, trials: Sequence[Trial], volume: float) -> str:
     """Return that a threshold was stated after distances were known, and which smaller ones before it do not hold."""
-    known_ones = "1 distance was" if known == 1 else f"{known} distances were"
-    parts = [f"the threshold was stated after {known_ones} known"] if known else []
+    count = known.known_before(tau, trials)
+    known_ones = "1 distance was" if count == 1 else f"{count} distances were"
+    parts = [f"the threshold was stated after {known_ones} known"] if count else []
+    stated = [each.threshold for each in known.thresholds or ()]
+    before = stated[: stated.index(tau)] if tau in stated else stated
+    smaller = sorted(each for each in before if each < tau and not certificate.covers(each, volume))
+    largest = max((trial.distance or 0.0 for trial in trials), default=0.0)
     falsified_ones = [each for each in smaller if each < largest]
     for group, how in ((falsified_ones, "falsified"), (smaller[len(falsified_ones) :], "left undecided")):
         if group:
-            limits = enumerated((quantities.of(f"{each:.6g}") for each in group), 5)
+            limits = enumerated((known.quantities.of(f"{each:.6g}") for each in group), 5)
             word, were, are = ("threshold", "was", "is") if len(group) == 1 else ("thresholds", "were", "are")
             parts.append(f"the smaller {word} {limits}, which {were} stated before, {are} {how}")
     return "".join(f"; {part}" for part in parts)
 
 
-def not_selected(known: int, others: int, falsifying: Sequence[str]) -> list[str]:
+def _not_selected(known: Provenance, count: int, tau: float) -> list[str]:
     """Return that neither a threshold nor a campaign was selected, by what was known and by other stores."""
-    distances = "distance that was" if known == 1 else "distances that were"
-    fitted = f"the threshold not being chosen to suit the {known} {distances} known when it was stated"
-    sentences, alone = [fitted] if known else [], "this campaign not being chosen among several"
+    distances = "distance that was" if count == 1 else "distances that were"
+    fitted = f"the threshold not being chosen to suit the {count} {distances} known when it was stated"
+    sentences, alone = [fitted] if count else [], "this campaign not being chosen among several"
+    others = len(known.beside)
     if not others:
         return [*sentences, alone]
     lie = "store of this experiment lies" if others == 1 else "stores of this experiment lie"
     which = "none of them falsifies the threshold" if others > 1 else "it does not falsify the threshold"
+    falsifying = [quoted(other.path.name) for other in known.beside if other.falsifies(tau)]
     if falsifying:
         verb = "falsifies" if len(falsifying) == 1 else "falsify"
-        count = "it falsifies" if others == 1 else f"{len(falsifying)} of them {verb}"
-        which = f"{count} the threshold ({enumerated(map(quoted, falsifying), 5)})"
+        them = "it falsifies" if others == 1 else f"{len(falsifying)} of them {verb}"
+        which = f"{them} the threshold ({enumerated(falsifying, 5)})"
     return [*sentences, f"{alone} ({others} other {lie} beside it, and {which})"]
-
-
-def _without_assumptions(certificate: Certificate, tau: float, quantities: Quantities) -> str:
-    tests = certificate.details.get("tests", {})
-    if tests.get("share_missed") is None:
-        return ""
-    draws = [f"{counted(tests['spread'], 'test')} drawn as a Latin hypercube"] if tests["spread"] else []
-    draws += [counted(tests["independent"], "independent draw")] if tests["independent"] else []
-    return (
-        f" By these tests alone, whatever the dynamics are: at most {at_most(100 * tests['share_missed'], 2)} % "
-        f"{of_tasks(certificate.distribution)} exceed {quantities.of(f'{tau:.6g}')} "
-        f"({' and '.join(draws)}, {percent(certificate.confidence)})."
-    )
 
 
 # Undecided
@@ -374,16 +370,3 @@ def _shortfall(certificate: Certificate) -> str:
         )
     left = f"; {missing} draws do not count, as their number was changed after they were known" if missing else ""
     return f"{outside}{left}"
-
-
-def outlook(forecast: Forecast, horizon: int) -> str:
-    """Return how many more executions are expected, and what they would decide, without a full stop."""
-    many = f"about {forecast.executions}" if forecast.executions is not None else f"more than {horizon}"
-    plural = "execution is" if forecast.executions == 1 else "executions are"
-    if forecast.fewest:
-        share = f"{100 * forecast.validated:.0f} % of the posterior samples of the dynamics stay below the threshold"
-        return f"at least {forecast.executions} more {plural} needed to validate it, and {share}"
-    shares = {"validated": forecast.validated, "falsified": forecast.falsified}
-    answer = max(shares, key=lambda name: shares[name])
-    outcome = f" ({answer} in {100 * shares[answer]:.0f} % of the simulated futures)" if shares[answer] else ""
-    return f"{many} more {plural} expected to decide{outcome}"

@@ -49,12 +49,10 @@ def distances(context: ReportContext) -> Markup:
             parts.append(paragraph(f"{d - len(axes)} parameters with less influence have no slice here."))
         slices = filter(None, (distance_along(context, axis, small=True) for axis in axes))
         parts += [heading("Slices through the worst task"), small_charts(list(slices))]
-    caption = (
-        "Sensitivity of the distance: the share of each parameter in the variance of the predicted distance, alone and "
-        "together with others (total Sobol index)"
-    )
+    meaning = "the share of each parameter in the variance of the predicted distance, alone and together with others"
     shares = ((context.space.labels[j], float(model.sensitivity[j])) for j in model.influence)
     rows = ((label, percent(share), bar(share)) for label, share in shares)
+    caption = f"Sensitivity of the distance: {meaning} (total Sobol index)"
     sensitivity = table(caption, ("Parameter", "Share", "Bar"), rows)
     return joined([*parts, element("div", sensitivity, predicted, class_="charts"), *_region(context)])
 
@@ -172,27 +170,21 @@ def _predicted(context: ReportContext, model: DistanceModel) -> Chart:
     if replayed:
         distances = [context.recordings[k].distance for k in replayed]
         chart.marks(distances, list(replayed.values()), "corrected", "by the corrected model")
-    beforehand = stored_predictions(context)
-    if beforehand:
+    if beforehand := stored_predictions(context):
         executed, expected = zip(*((distance_of(trial), stored.median) for trial, stored in beforehand), strict=True)
         chart.marks(executed, expected, "covering", "stored before the execution")
     return chart
 
 
 def _region(context: ReportContext) -> list[Markup]:
-    """Return where the threshold is kept; nothing if the certificate is of another kind or S is not known.
-
-    A task keeps it if its prediction from the trials before the independent draws, plus the margin of the certificate
-    ``region``, is at most the threshold.
-    """
+    """Return where the prediction plus the margin of a region certificate keeps the threshold; nothing without one."""
     certificate, learned, tau = context.certificate, context.provenance.learned, context.threshold
     if certificate is None or certificate.kind != "region" or learned is None or tau is None:
         return []
     margin, before = float(certificate.details["margin"]), int(certificate.details["learned_before"])
     space, d, model = context.space, context.space.dimension, context.distance_model
-    if d == 1:
-        unit = np.linspace(0, 1, _CURVE)[:, None]
-    else:
+    unit = np.linspace(0, 1, _CURVE)[:, None]
+    if d > 1:
         unit = _grid_of_tasks() if d == 2 else np.random.default_rng(0).random((400, d))
     bounds = learned.expected(unit, before) + margin
     inside, points, label = bounds <= tau, space.from_unit(unit), f"predicted {context.distance_label} + margin"
@@ -249,8 +241,7 @@ def distances_in_order(context: ReportContext) -> Chart | None:
     steps = np.repeat(numbers[risen], 2)[1:], np.repeat(so_far[risen], 2)[:-1]
     chart.line(np.append(steps[0], last), np.append(steps[1], so_far[-1]), "best", "largest so far")
     chart.limit(context.threshold, "threshold", "threshold").limit(context.bound, "bound", "bound on d*")
-    beforehand = stored_predictions(context)
-    if beforehand:
+    if beforehand := stored_predictions(context):
         at, expected = zip(*((trial.number, stored.median) for trial, stored in beforehand), strict=True)
         chart.marks(at, expected, "covering", "predicted before the execution")
     names = [f"trial {trial.number}: {number(trial.distance)}" for trial in context.completed]
@@ -269,11 +260,10 @@ def envelope(context: ReportContext) -> Markup:
     known = context.envelope
     if known is None:
         return Markup()
-    stated = [] if known.doubt is not None else [paragraph(text(known.statement, UNCUT))]
+    stated = None if known.doubt is not None else paragraph(text(known.statement, UNCUT))
     has_picture = known.doubt is None and context.suite is None and known.share > 0
-    drawn = [_trusted_tasks(context, known)] if has_picture else []
-    words = paragraph(text(known.words, UNCUT))
-    return element("div", heading("Where the model can be trusted"), *stated, words, joined(drawn), class_="envelope")
+    drawn, words = _trusted_tasks(context, known) if has_picture else None, paragraph(text(known.words, UNCUT))
+    return element("div", heading("Where the model can be trusted"), stated, words, drawn, class_="envelope")
 
 
 def _trusted_tasks(context: ReportContext, known: Envelope) -> Chart:

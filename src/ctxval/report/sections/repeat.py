@@ -69,6 +69,7 @@ def identity(context: ReportContext) -> dict[str, str]:
     search = context.description.get("search")
     known = ("space", "task", "system", "model", "synthesizer", "distance")
     digests = {f"digest of the {name}": digest(part) for name, part in context.parts.items() if name in known}
+    trials = [[trial.number, trial.state, trial.unit_point.tolist(), trial.distance] for trial in context.trials]
     return {
         "store": str(context.store.name),
         "search": str(search.get("type")) if isinstance(search, Mapping) else "not known",
@@ -79,9 +80,7 @@ def identity(context: ReportContext) -> dict[str, str]:
         "version of scipy": scipy.__version__,
         "processor": platform.machine(),
         **digests,
-        "digest of the trials": digest(
-            [[trial.number, trial.state, trial.unit_point.tolist(), trial.distance] for trial in context.trials]
-        ),
+        "digest of the trials": digest(trials),
     }
 
 
@@ -91,10 +90,7 @@ def digest(value: Any) -> str:
 
 
 def repeating_command(context: ReportContext) -> str:
-    """Return the command that runs the campaign again, into a new store; empty if no command made the store.
-
-    The new store has a folder of its own, because it is no other campaign among which one is chosen.
-    """
+    """Return the command that runs the campaign again, into a store in a folder of its own; empty if none made it."""
     path = Path(path_of(context))
     return command_of(context, None, "--store", str(path.parent / "again" / path.name))
 
@@ -106,11 +102,9 @@ def command_of(context: ReportContext, budget: int | None = None, *others: str) 
 
 
 def run_command(settings: Mapping[str, Any], budget: int | None, *others: str, target: str = "") -> str:
-    """Return the command that runs a campaign with settings as a store keeps them.
+    """Return the command that runs a campaign with settings as a store keeps them, and with ``others`` beside them.
 
-    Args:
-        others: options that are not among the settings, with their values.
-        target: the experiment, if it must be named otherwise than in the settings.
+    ``target`` is the experiment, if it must be named otherwise than in the settings.
     """
     file = settings.get("file")
     named = None if file else settings.get("experiment")
@@ -132,11 +126,8 @@ def run_command(settings: Mapping[str, Any], budget: int | None, *others: str, t
     }
     for option, (value, default) in values.items():
         words += [] if value is None or value == default else [option, str(value)]
-    flags = {
-        "--explore": settings.get("explore"),
-        "--decide": settings.get("explore") is False,
-    }
-    words += [flag for flag, wanted in flags.items() if wanted is True]
+    explore = settings.get("explore")
+    words += ["--explore"] if explore is True else ["--decide"] if explore is False else []
     for name, value in options.items():
         words += ["--option", f"{name}={value}"]
     return shlex.join([*words, *others])
@@ -196,13 +187,12 @@ def appendix(context: ReportContext) -> Iterator[Entry]:
     space, units, certificate, digests = context.space, context.labels.units, context.certificate, identity(context)
     synthesizer = None if context.validation is None else type(context.validation.synthesizer).__name__
     design = "" if synthesizer is None else f", with the synthesizer {synthesizer}"
-    yield Entry(
-        "Intended use",
-        f"{_NASA}, {_V10}",
+    use = (
         f"The model predicts closed loops under controllers that are designed on it{design}, for the tasks of "
         f"{context.name or 'this experiment'}: {_box(context, space.low, space.high)}. Distribution of tasks: "
-        f"{context.provenance.distribution or 'uniform'}.",
+        f"{context.provenance.distribution or 'uniform'}."
     )
+    yield Entry("Intended use", f"{_NASA}, {_V10}", use)
     described = context.parts.get("distance")
     kind = described.get("type", "a function") if isinstance(described, dict) else described or "not known"
     yield Entry(
@@ -218,13 +208,12 @@ def appendix(context: ReportContext) -> Iterator[Entry]:
     yield Entry("Acceptance criterion (accuracy requirement)", f"{_NASA}, {_V10}", criterion)
     origins = Counter(trial.origin for trial in context.trials)
     listed = ", ".join(f"{count} {origin}" for origin, count in sorted(origins.items()))
-    yield Entry(
-        "Referent data",
-        f"{_NASA}, {_V10}",
+    referent = (
         f"{context.executions} executions of the system in {len(context.trials)} trials ({listed or 'none'}), of which "
         f"{len(context.completed)} gave a distance and {len(context.recordings)} a recorded trajectory. Digest of the "
-        f"description of the system: {digests.get('digest of the system', 'not known')}.",
+        f"description of the system: {digests.get('digest of the system', 'not known')}."
     )
+    yield Entry("Referent data", f"{_NASA}, {_V10}", referent)
     error, executed = "No distance is known.", "Nothing was executed."
     if context.completed:
         worst = context.worst_first[0]
@@ -263,19 +252,13 @@ def appendix(context: ReportContext) -> Iterator[Entry]:
     yield Entry("Results robustness (sensitivity)", _NASA, robustness)
     yield Entry("Assumptions", f"{_NASA}, {_V10}", f"{assumptions}.")
     yield Entry("Limits of the assessment: what was not tested", f"{_NASA}, {_V10}", " ".join(context.not_tested))
-    yield Entry(
-        "Verification",
-        f"{_NASA}, {_V10}",
-        "Software and solution verification of the model itself are not part of this campaign. Diagnostics of the "
-        f"campaign: {lights or 'nothing is unusual'}.",
-    )
+    verification = "Software and solution verification of the model itself are not part of this campaign."
+    found = f"Diagnostics of the campaign: {lights or 'nothing is unusual'}."
+    yield Entry("Verification", f"{_NASA}, {_V10}", f"{verification} {found}")
     yield Entry("Changes during the campaign", _NASA, changes or "None is recorded.")
-    yield Entry(
-        "Provenance",
-        _NASA,
-        f"Store {context.store.name}; ctxval {VERSION}; command: {command_of(context) or 'none'}; digest of the "
-        f"description of the model: {digests.get('digest of the model', 'not known')}.",
-    )
+    described_as = f"digest of the description of the model: {digests.get('digest of the model', 'not known')}"
+    command = f"command: {command_of(context) or 'none'}"
+    yield Entry("Provenance", _NASA, f"Store {context.store.name}; ctxval {VERSION}; {command}; {described_as}.")
     conclusion = str(context.verdict or "No verdict, because no threshold was stated.")
     yield Entry("Conclusion", f"{_NASA}, {_V10}", conclusion)
 

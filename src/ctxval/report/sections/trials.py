@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,26 +27,27 @@ def trials(context: ReportContext) -> Markup:
     """Return the table of all trials, the place for one trial, its data, and the worst trials."""
     if not context.trials:
         return paragraph("There are no trials.")
-    lines, notes = recorded_lines(context), list[str]()
-    if lines.left_out:
+    data, points = recorded_lines(context)
+    kept, notes = data["trials"], list[str]()
+    if left_out := len(context.recordings) - len(kept):
         notes.append(
-            f"The page has the trajectories of {len(lines.kept)} of {len(context.trials)} trials. Those of "
-            f"{len(lines.left_out)} trials with smaller distances are left out, so that the page stays small."
+            f"The page has the trajectories of {len(kept)} of {len(context.trials)} trials. Those of {left_out} trials "
+            "with smaller distances are left out, so that the page stays small."
         )
-    if lines.thinned:
-        notes.append(f"Each line has about {lines.points} of the recorded points; `ctxval export` writes all of them.")
+    if any(run.system.horizon + 1 > points for run in context.recordings.values()):
+        notes.append(f"Each line has about {points} of the recorded points; `ctxval export` writes all of them.")
     if not context.replays and context.missing:
         notes.append("The corrected model is not drawn, because the experiment is not loaded.")
     elif context.replays:
         notes.append("The corrected model in each trial is learned from the other trials.")
     # Data for the page's script: the element is no script itself, and its content cannot end it.
-    plain = json.dumps(lines.data, allow_nan=False, separators=(",", ":"))
+    plain = json.dumps(data, allow_nan=False, separators=(",", ":"))
     escaped = Markup(plain.translate({ord(character): f"\\u{ord(character):04x}" for character in "<>&"}))
     # Those with the largest distances, and those without a distance.
     shown = [*context.worst_first, *(trial for trial in context.trials if trial.distance is None)][:_ROWS]
     headers = ("trial", "distance", "state", "origin", *context.task_labels, "time [s]", "attempts", "remarks")
     tasks = zip(shown, context.tasks_of(shown), strict=True)
-    rows = [_row(trial, task, trial.number in lines.kept) for trial, task in tasks]
+    rows = [_row(trial, task, str(trial.number) in kept) for trial, task in tasks]
     caption = f"Trials, the largest distance first{'' if len(shown) == len(context.trials) else f' ({_ROWS} of them)'}"
     worst = context.worst_tasks(recorded=True)
     drawn = [heading(f"The {counted(len(worst), 'worst task')}")]
@@ -55,15 +55,13 @@ def trials(context: ReportContext) -> Markup:
         head = f"Trial {trial.number}: {quantity(trial.distance, context.labels.units)} at {task_of(context, trial)}"
         drawn.append(details(head, small_charts(_signals(context, trial.number)), opened=trial is worst[0]))
     without = paragraph("No trajectories are recorded, so the worst tasks cannot be drawn.")
-    return joined(
-        [
-            *([paragraph(" ".join(notes))] if notes else []),
-            table(caption, headers, rows, "sortable", id_="trials", label="Table of trials", scroll="scroll tall"),
-            element("div", id="trial", aria_live="polite", class_="needs-script"),
-            element("script", escaped, type="application/json", id="trial-data"),
-            *(drawn if worst else [without]),
-        ]
-    )
+    parts = [paragraph(" ".join(notes))] if notes else []
+    parts += [
+        table(caption, headers, rows, "sortable", id_="trials", label="Table of trials", scroll="scroll tall"),
+        element("div", id="trial", aria_live="polite", class_="needs-script"),
+        element("script", escaped, type="application/json", id="trial-data"),
+    ]
+    return joined([*parts, *(drawn if worst else [without])])
 
 
 def _row(trial: Trial, task: list[float | str], recorded: bool) -> Markup:
@@ -111,19 +109,8 @@ def _signals(context: ReportContext, trial: int) -> list[Chart]:
     return charts
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedLines:
-    """The lines of as many trials as fit, ready for JSON, the worst first, and the largest number of their points."""
-
-    data: dict[str, Any]
-    kept: tuple[int, ...]
-    left_out: tuple[int, ...]
-    points: int
-    thinned: bool
-
-
-def recorded_lines(context: ReportContext, most: int = 850_000) -> RecordedLines:
-    """Return the lines of the trials, with fewer points or fewer trials if they have too many characters together."""
+def recorded_lines(context: ReportContext, most: int = 850_000) -> tuple[dict[str, Any], int]:
+    """Return the lines of as many trials as fit, ready for JSON, the worst first, and the largest number of points."""
     numbers, points = list(context.recordings), 0
     lines: dict[int, dict[str, Any]] = {}
     for points in (200, 120, 70):
@@ -139,16 +126,11 @@ def recorded_lines(context: ReportContext, most: int = 850_000) -> RecordedLines
             break
     kinds = zip(("state", "input"), context.signals, strict=True)
     signals = [{"label": shortened(visible(name), 120), "kind": kind} for kind, names in kinds for name in names]
-    longest = max((run.system.horizon + 1 for run in context.recordings.values()), default=0)
-    data = {"signals": signals, "trials": {str(number): of_trial for number, of_trial in lines.items()}}
-    return RecordedLines(data, tuple(lines), tuple(numbers[len(lines) :]), points, longest > points)
+    return {"signals": signals, "trials": {str(number): of_trial for number, of_trial in lines.items()}}, points
 
 
 def lines_of(context: ReportContext, number: int, points: int) -> dict[str, Any]:
-    """Return the lines of one trial: times, M, S minus M, corrected M minus M, and the reference.
-
-    Differences are stored, because a small error of M would vanish in the steps of the values.
-    """
+    """Return the lines of one trial: times, M, the differences of S and corrected M from M, and the reference."""
     model, system = context.recordings[number].model, context.recordings[number].system
     rows: Rows = np.arange(system.horizon + 1)
     if len(rows) > points:  # evenly spread, and those of the largest error of each state

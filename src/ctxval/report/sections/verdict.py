@@ -28,8 +28,8 @@ def verdict(context: ReportContext) -> Markup:
     """Return the first screen: the verdict, its sentence, the picture, the next step and the numbers."""
     answer = "no verdict" if context.verdict is None else context.verdict.answer
     word = element("p", _shape(answer), " ", answer.capitalize(), class_="word")
-    curve = context.space.dimension == 1 and context.suite is None
-    chart = (distance_along(context, 0) if curve else None) or distances_in_order(context)
+    curve = distance_along(context, 0) if context.space.dimension == 1 and context.suite is None else None
+    chart = curve or distances_in_order(context)
     picture = element("div", chart or paragraph("No distance is known yet."), class_="picture")
     advice, command = _next(context)
     block = markup.code(command, "Next command") if command else None
@@ -117,8 +117,7 @@ def _remarks(context: ReportContext) -> list[Markup]:
     # The sentence of the verdict says why a certificate is refused or withdrawn.
     findings = [finding for finding in [*context.diagnostics, *context.insights] if finding.name != "Certificate"]
     for light in ("bad", "attention"):
-        names = [finding.name for finding in findings if finding.light == light]
-        if names:
+        if names := [finding.name for finding in findings if finding.light == light]:
             word = element("span", WORDS[light].capitalize(), class_=f"light {light}")
             remarks.append(paragraph(word, f" {'; '.join(names)} (below)"))
     if context.missing:
