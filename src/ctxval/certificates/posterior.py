@@ -48,7 +48,8 @@ class Posterior(CertificateKind):
     #: withdrawn. With 1 it is never withdrawn for this reason.
     resolution: PositiveFloat = RESOLUTION
 
-    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+    @checked
+    def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
         """Return the bound that d* stays below with the confidence, and a forecast if it is above the threshold."""
         threshold = sample.threshold
         # Many trials that do not cover the tasks are refused before the draws, which take long.
