@@ -109,9 +109,9 @@ heavy-bin, hidden-heat, hidden-load, corner-stop, hidden-post, gate-at-post and 
 volume. Version 8, the present one, does not trust runs to places that no execution entered; it differs from 7 on
 boat-in-current, oblique-wall and taut-tether, which have positions. Version 7 found 97, 79 and 63 % there. The
 condition is that of a validation; without it, a patch of 0.12 m made 1.05 % of a puck's tasks falsely trusted.)
-Of each system, 70 % of the tasks keep the threshold. "Found" is the share of these tasks that the envelope trusts; "false" is the share of all tasks that it
-trusts although their true distance is larger. True sets are known at {tasks} random tasks, of noisy systems at
-{noisy_tasks} tasks by {repeats} executions each.
+Of each system, 70 % of the tasks keep the threshold. "Found" is the share of these tasks that the envelope trusts;
+"false" is the share of all tasks that it trusts although their true distance is larger. True sets are known at {tasks}
+random tasks, of noisy systems at {noisy_tasks} tasks by {repeats} executions each.
 [How to use an envelope](how-to/envelope.md) says what it is.
 
 **The median share found is {found:.0f} %. It is at least 80 % on {enough} of {systems} systems, of which {contacts}

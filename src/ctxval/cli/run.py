@@ -114,8 +114,8 @@ def run(
         if known is not None:
             task = campaign.validation.space.describe_point(known.parameters.points)
             missed = None if estimate is None else 100 * (known.distance - estimate) / known.distance
-            found = {"distance": known.distance, "task": task, "method": known.method}
-            report |= {"truth": found, "error_percent": missed}
+            largest = {"distance": known.distance, "task": task, "method": known.method}
+            report |= {"truth": largest, "error_percent": missed}
         result = {"verdict": None if verdict is None else verdict.to_json(), "budget": total}
         if with_report:
             page = path.with_suffix(".report.html")

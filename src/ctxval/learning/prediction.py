@@ -72,9 +72,9 @@ class PredictedDistance:
             distances[~is_executed] = self(points[~is_executed])[0]
         if len(known):
             without = self.posterior.means_without(list(filter(None, executions)))
-            own = self.planner.own_distances
+            distances_on = self.planner.own_distances
             with single_threaded():
-                parts = halved(lambda some: own(without[some], known[some, None])[:, 0], len(known))
+                parts = halved(lambda some: distances_on(without[some], known[some, None])[:, 0], len(known))
             distances[is_executed] = np.concatenate([[np.nan] if part is None else part for _, part in parts])
         return np.where(np.isfinite(distances), distances, np.nan)
 

@@ -279,8 +279,8 @@ class ConvergedGP(Study):
         axes.plot(x[:5], y[:5], **marks, color="white", label="first samples")
         axes.plot(x[5:], y[5:], **marks, color=study.BLACK, label="acquired samples")
         best = y.argmax()
-        found = marks | {"marker": "*", "markersize": 14, "label": "maximum found"}
-        axes.plot(x[best], y[best], **found, color=study.ORANGE)
+        star = marks | {"marker": "*", "markersize": 14, "label": "maximum found"}
+        axes.plot(x[best], y[best], **star, color=study.ORANGE)
         axes.grid(False)
 
     def data(self, results: Results, scale: Scale) -> Columns:

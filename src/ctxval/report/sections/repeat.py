@@ -253,8 +253,8 @@ def appendix(context: ReportContext) -> Iterator[Entry]:
     yield Entry("Assumptions", f"{_NASA}, {_V10}", f"{assumptions}.")
     yield Entry("Limits of the assessment: what was not tested", f"{_NASA}, {_V10}", " ".join(context.not_tested))
     verification = "Software and solution verification of the model itself are not part of this campaign."
-    found = f"Diagnostics of the campaign: {lights or 'nothing is unusual'}."
-    yield Entry("Verification", f"{_NASA}, {_V10}", f"{verification} {found}")
+    unusual = f"Diagnostics of the campaign: {lights or 'nothing is unusual'}."
+    yield Entry("Verification", f"{_NASA}, {_V10}", f"{verification} {unusual}")
     yield Entry("Changes during the campaign", _NASA, changes or "None is recorded.")
     described_as = f"digest of the description of the model: {digests.get('digest of the model', 'not known')}"
     command = f"command: {command_of(context) or 'none'}"

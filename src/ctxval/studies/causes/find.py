@@ -233,8 +233,8 @@ class _Study:
 
     def _reported(self, group: list[Explained], ranked: list[Explanation], began_elsewhere: bool) -> CauseReport:
         named = bool(group) and group[0].counts(self.before) and group[0].complete >= _NAMED
-        told = group and not self.outputs and not began_elsewhere
-        from_tasks = self.loops.distance_from_tasks(group[0].explanation.repaired) if told else None
+        is_measured = group and not self.outputs and not began_elsewhere
+        from_tasks = self.loops.distance_from_tasks(group[0].explanation.repaired) if is_measured else None
         return CauseReport(
             plant=self.plant,
             explained=tuple(group),
