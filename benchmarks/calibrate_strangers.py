@@ -21,7 +21,7 @@ from dynamics_truths import digest
 from strangers_development import DEVELOPMENT
 from strangers_diagnostics import JudgedRun
 from strangers_reporting import REPORTING
-from strangers_truths import TRUTHS
+from strangers_truths import SEEDS, TRUTHS
 
 RULE = 9
 """Version of the rule by which campaigns are run: 9 looks beside a failed test only if what is learned does not explain
@@ -31,7 +31,7 @@ the corners of positions, so that those of systems without positions are as by r
 failed, if what is learned explains it by now; 4 finds task parameters that change the dynamics, and leaves out data of
 M that contradict the executions; 3 learns histories and noise, and tests are points of a hypercube."""
 
-BUDGET, SEEDS = 25, 2
+BUDGET = 25
 FALSE, TRUE = (0.8, 0.95, 0.99), (1.1, 1.25, 1.5)
 """Thresholds as shares of d*: those that must not be validated, and those that should be on regular systems."""
 
@@ -91,14 +91,14 @@ def main() -> None:
     """Run what is missing, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("half", choices=HALVES)
-    parser.add_argument("--seeds", type=int, default=SEEDS)
+    parser.add_argument("--seeds", type=int, help=f"{SEEDS} if it is not given")
     parser.add_argument("--shares", nargs="*", type=float, default=[*FALSE, *TRUE])
     parser.add_argument("--regular", action="store_true", help="only systems for which the assumptions hold")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
     runs = [
         (name, seed, share)
-        for seed in range(options.seeds)
+        for seed in range(options.seeds or SEEDS[options.half])
         for share in options.shares
         for name in HALVES[options.half]
         if not (options.regular and ENTRIES[name].misleading)

@@ -28,6 +28,8 @@ from study_auto import RESULTS
 
 TRUTHS = JsonLines(RESULTS / "strangers_truths.jsonl", ("entry", "seed", "digest"))
 ENTRIES = {**DEVELOPMENT, **REPORTING}
+SEEDS = {"development": 2, "reporting": 10}
+"""Seeds of each system, of which each is another system."""
 SAMPLES, MOST, DRAWS = 24000, 6, 20000
 """Random tasks that each repeat begins with, the most repeats, and random tasks that shares are counted on."""
 TOUCHED = 1e-6
@@ -155,13 +157,14 @@ HEADS = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", default=list(ENTRIES))
-    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--seeds", type=int, help=f"{SEEDS} if it is not given")
     options = parser.parse_args()
     print("| " + " | ".join(HEADS) + " |")
     print("|---" * len(HEADS) + "|")
     for name in options.names:
         entry = ENTRIES[name]
-        print(row(entry, [truth(entry, seed) for seed in range(options.seeds)]), flush=True)
+        seeds = options.seeds or SEEDS["reporting" if name in REPORTING else "development"]
+        print(row(entry, [truth(entry, seed) for seed in range(seeds)]), flush=True)
 
 
 if __name__ == "__main__":
