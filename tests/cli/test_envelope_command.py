@@ -42,6 +42,7 @@ def test_one_that_is_not_stated_says_why_and_writes_no_function(
     assert "trusted.py is not written, because no task is trusted" in " ".join(shown.split())
 
 
+@pytest.mark.thorough  # 15 s
 def test_what_an_envelope_assumes_is_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
