@@ -189,18 +189,17 @@ class EnvelopeSearch:
             return Choice.tested(evidence.untried.task)
         pool, is_suite = learned.study.search.pool, recorder.validation.space.members is not None
         drawn = self._at(learned, pool if is_suite else pool[:_SCREENED], settled=False)
-        below, most = drawn.mean <= self._threshold, most_beyond(evidence)
+        below, leaving = drawn.mean <= self._threshold, drawn.uncovered(most_beyond(evidence))
         # Within three spreads above the mean, a task is uncertain.
         straddle = 3.0 * drawn.spread(self._threshold) - np.abs(drawn.mean - self._threshold)  # Bryan et al. 2006
-        uncertain, uncovered = below & (straddle > 0), below & (np.maximum(drawn.beyond / most, drawn.away) > 1)
+        uncertain, uncovered = below & (straddle > 0), below & (leaving > 1)
         if drawn.crossed is not None:  # executions of these tasks would not teach the regular part
             uncertain, uncovered = uncertain & (drawn.crossed <= 0), uncovered & (drawn.crossed <= 0)
             straddle = np.where(drawn.crossed <= 0, straddle, -np.inf)
         few = evidence.executions < fewest_executions(evidence)
         # Share of the tasks predicted below the threshold that may be uncertain or uncovered at the end.
         if few or (uncertain | uncovered).sum() > 0.03 * below.sum():
-            leading = np.where(uncovered, np.maximum(drawn.beyond / most, drawn.away), -np.inf)
-            score = straddle if uncertain.sum() >= uncovered.sum() else leading
+            score = straddle if uncertain.sum() >= uncovered.sum() else np.where(uncovered, leaving, -np.inf)
             executed = np.array([trial.unit_point for trial in recorder.trials])
             away = np.abs(drawn.points[:, None] - executed).max(axis=2)
             new = (away > (0.0 if is_suite else NEAR)).all(axis=1)
@@ -244,8 +243,8 @@ class EnvelopeSearch:
         return drawn.and_others(self._at(learned, nearest))
 
     def _at(self, learned: LearnedDynamics, points: Array, *, settled: bool = True) -> DrawnDistances:
-        drawn = learned.drawn_distances(points, draws_for(self._confidence), settled=settled)
-        values, beyond, away, crossed = drawn
+        draws = draws_for(self._confidence)
+        values, beyond, away, crossed = learned.drawn_distances(points, draws, settled=settled)
         return DrawnDistances(points, values, beyond, away / POCKET, crossed)
 
 

@@ -148,9 +148,10 @@ class IntervalSearch:
         # The whole evidence may decide if nothing that a few draws show leaves the verdict open.
         bound, enough = self._bound(evidence), len(self._ended) >= FEWEST
         decides = enough and raised(evidence, bound) <= self.limit and doubt_of(evidence, self.best, bound) is None
-        is_kept = dynamics.kept_evidence(trials, self.options.confidence) is not None
-        if decides and not is_kept and (learned := dynamics.learned(trials)) is not None:
-            evidence = replace(evidence, pocket=learned.pocket)
+        kept = dynamics.kept_evidence
+        if decides and evidence.pocket is None and kept(trials, self.options.confidence) is None:
+            learned = dynamics.learned(trials)
+            evidence = evidence if learned is None else replace(evidence, pocket=learned.pocket)
             decides = unentered_pocket(evidence) is None
         if decides:
             whole = dynamics.evidence(trials, self.options.confidence, keep=self.keeps)

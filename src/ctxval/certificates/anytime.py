@@ -65,7 +65,14 @@ class AnytimeAudit(CertificateKind):
             "failures": sample.failures,
         }
         return Certificate(
-            *(self.name, statement, threshold, confidence, volume, n, assumptions, details),
+            kind=self.name,
+            statement=statement,
+            upper_bound=threshold,
+            confidence=confidence,
+            volume=volume,
+            trials=n,
+            assumptions=assumptions,
+            details=details,
             distribution=sample.distribution,
         )
 

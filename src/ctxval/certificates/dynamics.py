@@ -112,8 +112,8 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
     coverage, worst = evidence.coverage, diagnostics.failed(evidence, bound)
     doubt, differing = statements.both_outcomes(sample, stochastic=False), sample.differing(1e-6 * bound)
     # Two executions of one task must not differ by more than a prediction may be wrong.
-    rows = sample.differing(diagnostics.ACCURATE * bound)
-    if doubt is None and evidence.quantile is None and rows is not None:
+    unlike = diagnostics.ACCURATE * bound
+    if doubt is None and evidence.quantile is None and (rows := sample.differing(unlike)) is not None:
         doubt = (
             f"{statements.two_distances(sample, rows)} in the recorded state, or was changed in between, so the bound "
             "is withdrawn; record more states, use --kind posterior, or use a new store after a change"

@@ -104,11 +104,17 @@ class DrawnDistances(ShortRepr):
             None if self.crossed is None or others.crossed is None else np.concatenate([self.crossed, others.crossed]),
         )
 
+    def uncovered(self, most: float) -> Array:
+        """Return how far loops leave records, by ``most`` at most, and places ``(K,)``: above 1 they do so too far."""
+        return np.asarray(np.maximum(self.beyond / most, self.away))
+
     def leaving(self, most: float) -> Array:
         """Return how far loops leave records and places, or cross the boundary ``(K,)``; nothing is known above 1."""
-        # Both have the same slope: smaller slopes cost more of the set, because their errors reach farther.
-        beyond = self.beyond if self.crossed is None else np.maximum(self.beyond, most + self.crossed)
-        return np.asarray(np.minimum(np.maximum(beyond / most, self.away), LARGEST))
+        leaving = self.uncovered(most)
+        if self.crossed is not None:
+            # Both have the same slope: smaller slopes cost more of the set, because their errors reach farther.
+            leaving = np.maximum(leaving, (most + self.crossed) / most)
+        return np.asarray(np.minimum(leaving, LARGEST))
 
     def upper(self, factor: float, threshold: float) -> Array:
         """Return mean + k spread as shares of the threshold ``(K,)``, at most ``LARGEST``."""

@@ -105,8 +105,15 @@ def ask(
         trials = "trial is" if len(others) == 1 else "trials are"
         out.say(f"{len(others)} other {trials} open: {enumerated(others, 10)}.")
     out.say(f"next: ctxval tell {shlex.quote(str(path))} {waiting.number} --trajectory run.csv")
-    report = {"trial": waiting.number, "task": waiting.trial.parameters, "origin": waiting.trial.origin}
-    return {**report, "store": str(path), "folder": str(folder), "files": files, "open": others}
+    return {
+        "trial": waiting.number,
+        "task": waiting.trial.parameters,
+        "origin": waiting.trial.origin,
+        "store": str(path),
+        "folder": str(folder),
+        "files": files,
+        "open": others,
+    }
 
 
 @command()
@@ -176,9 +183,15 @@ def _say_result(opened: Opened, trial: Trial) -> None:
 
 
 def _ended(opened: Opened, trial: Trial) -> dict[str, Any]:
-    result = {"state": trial.state, "distance": trial.distance, "failure": trial.failure}
-    store = {"executions": opened.campaign.executions, "store": str(opened.path)}
-    return {"trial": trial.number, "task": trial.parameters, **result, **store}
+    return {
+        "trial": trial.number,
+        "task": trial.parameters,
+        "state": trial.state,
+        "distance": trial.distance,
+        "failure": trial.failure,
+        "executions": opened.campaign.executions,
+        "store": str(opened.path),
+    }
 
 
 @command(with_json=False)

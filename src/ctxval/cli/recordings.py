@@ -230,10 +230,17 @@ def fit_models(
     bounds = function.bounds
     require_model_file(out_, [*logs, reading.mapping, given], force=force)
     recordings = reading.read(logs)
-    how: dict[str, Any] = {"step": function.load(), "bounds": bounds, "vectorized": function.vectorized, "seed": seed}
-    how["given"] = None if given is None else named_model(given, {}, recordings.dt)
-    how |= {"hold_out": hold_out, "steps": FITTED if steps is None else numbers(steps)}
-    report = fit(recordings, [name.strip() for name in kinds], **how)
+    report = fit(
+        recordings,
+        [name.strip() for name in kinds],
+        step=function.load(),
+        bounds=bounds,
+        vectorized=function.vectorized,
+        given=None if given is None else named_model(given, {}, recordings.dt),
+        hold_out=hold_out,
+        steps=FITTED if steps is None else numbers(steps),
+        seed=seed,
+    )
     print_breaks(recordings)
     _print_fit(report)
     if not report.fitted:

@@ -80,11 +80,19 @@ def run(
     sentence = f": S {system}, M {model}{learned}, controllers {synthesizer}{against}"
     out.say((experiment.name, "bold"), sentence, wrap=True)
     with _live_page(live, ServedCampaign(experiment, campaign, limit, certificate, total), settings) as shown:
-        take = None if shown is None else shown.take
-        how: dict[str, Any] = {"explore": settings.explores, "envelope": envelope, "within": settings.within}
-        how |= {"certificate": certificate, "timeout": timeout, "again": again_failed}
         with _workers(workers, dask) as execution:
-            campaign.run(total, limit, take, **how, **execution)
+            campaign.run(
+                total,
+                limit,
+                None if shown is None else shown.take,
+                explore=settings.explores,
+                envelope=envelope,
+                within=settings.within,
+                certificate=certificate,
+                timeout=timeout,
+                again=again_failed,
+                **execution,
+            )
         known = experiment.truth() if truth and experiment.truth is not None else None
         digest = campaign.store.digest()
         verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
@@ -95,22 +103,28 @@ def run(
         if verdict is None and not settings.explores:
             with suppress(CertificateError):
                 bound = campaign.certify(certificate=certificate)
-        worst, estimate, expected = campaign.worst, campaign.estimate, None if verdict is None else verdict.expected
-        report: dict[str, Any] = {"case": experiment.name}
-        if settings.options:
-            report["options"] = settings.options
-        report |= {"search": settings.search.name, "seed": settings.seed, "budget": total}
-        report |= {"executions": campaign.executions, "failed": len(campaign.failed)}
-        report |= {"failures": base.failures_of(campaign.failed), "controllers": designs_sentence(campaign.trials)}
-        interval = None if worst is None else [worst.distance, bound and bound.bound]
-        report |= {"worst": base.worst_of(worst), "estimate": estimate, "interval": interval, "units": units}
-        without = dict.fromkeys(("verdict", "reason", "rests_on", "threshold"))
-        report |= without if verdict is None else verdict.to_json()
-        report["certificate"] = None if bound is None else bound.to_json()
-        if trusted is not None:
-            report["envelope"] = trusted.to_json()
-        report |= {"expected": None if expected is None else asdict(expected), "store": str(path)}
-        report["other_stores"] = [str(other.path) for other in other_stores(path)]
+        estimate, expected = campaign.estimate, None if verdict is None else verdict.expected
+        report: dict[str, Any] = {
+            "case": experiment.name,
+            **({"options": settings.options} if settings.options else {}),
+            "search": settings.search.name,
+            "seed": settings.seed,
+            "budget": total,
+            "executions": campaign.executions,
+            "failed": len(campaign.failed),
+            "failures": base.failures_of(campaign.failed),
+            "controllers": designs_sentence(campaign.trials),
+            "worst": base.worst_of(campaign.worst),
+            "estimate": estimate,
+            "interval": None if campaign.worst is None else [campaign.worst.distance, bound and bound.bound],
+            "units": units,
+            **(dict.fromkeys(("verdict", "reason", "rests_on", "threshold")) if verdict is None else verdict.to_json()),
+            "certificate": None if bound is None else bound.to_json(),
+            **({} if trusted is None else {"envelope": trusted.to_json()}),
+            "expected": None if expected is None else asdict(expected),
+            "store": str(path),
+            "other_stores": [str(other.path) for other in other_stores(path)],
+        }
         if known is not None:
             task = campaign.validation.space.describe_point(known.parameters.points)
             missed = None if estimate is None else 100 * (known.distance - estimate) / known.distance

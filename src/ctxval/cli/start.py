@@ -74,11 +74,14 @@ def check(
     failed = any(finding.state == "failed" for finding in findings)
     status, simulated = BAD_INPUT if failed else 0, None
     if aspect1 and not failed:
-        table, how = settings.aspect1, dict[str, Any](seed=settings.seed)
-        how["threshold"] = table.threshold if threshold is None else threshold
-        how["distance"] = None if table.distance is None else part("distance", table.distance, settings.folder)
-        how["tasks"] = table.tasks if tasks is None else tasks
-        simulated = model_alone.check(experiment.validation, **how)
+        table = settings.aspect1
+        simulated = model_alone.check(
+            experiment.validation,
+            threshold=table.threshold if threshold is None else threshold,
+            distance=None if table.distance is None else part("distance", table.distance, settings.folder),
+            tasks=table.tasks if tasks is None else tasks,
+            seed=settings.seed,
+        )
         findings += aspect1_findings(simulated)
         status = FALSIFIED if simulated.exceeding and simulated.completes is False else 0
     colours = {"ok": "green", "noted": "yellow", "failed": "bold red", "skipped": "dim"}
@@ -119,9 +122,14 @@ def reproduce(
 
     with Progress(TextColumn("runs"), *Progress.get_default_columns(), console=err) as progress:
         line = progress.add_task("")
-        how: dict[str, Any] = {"stored": results, "scale": paper.QUICK if quick else paper.FULL, "workers": workers}
-        how["on_start"] = lambda missing: progress.update(line, total=missing)
-        how["on_done"] = lambda job: progress.update(line, advance=1, description=job.key)
-        table = paper.reproduce(name, out_, **how)
+        table = paper.reproduce(
+            name,
+            out_,
+            stored=results,
+            scale=paper.QUICK if quick else paper.FULL,
+            workers=workers,
+            on_start=lambda missing: progress.update(line, total=missing),
+            on_done=lambda job: progress.update(line, advance=1, description=job.key),
+        )
     out.say(f"table: {table}")
     out.say(f"figures and data: {out_}")

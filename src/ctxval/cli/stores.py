@@ -43,11 +43,21 @@ def status(store: Path) -> Any:
     numbers = {state: [trial.number for trial in trials if trial.state == state] for state in states}
     measured = [trial for trial in trials if trial.distance is not None]
     worst = base.worst_of(max(measured, key=lambda trial: trial.distance or 0, default=None))
-    report: dict[str, Any] = {"case": description.get("name"), "search": search, "seed": description.get("seed")}
-    report |= {"executions": sum(trial.executed for trial in trials), "failed": len(numbers["failed"])}
-    report |= {"failures": base.failures_of(trials), "unmeasured": numbers["unmeasured"], "open": numbers["open"]}
-    report |= {"worst": worst, "verdict": verdict, "thresholds": thresholds}
-    report |= {"changes": [asdict(change) for change in changes], "store": str(store)}
+    report: dict[str, Any] = {
+        "case": description.get("name"),
+        "search": search,
+        "seed": description.get("seed"),
+        "executions": sum(trial.executed for trial in trials),
+        "failed": len(numbers["failed"]),
+        "failures": base.failures_of(trials),
+        "unmeasured": numbers["unmeasured"],
+        "open": numbers["open"],
+        "worst": worst,
+        "verdict": verdict,
+        "thresholds": thresholds,
+        "changes": [asdict(change) for change in changes],
+        "store": str(store),
+    }
     print_table({key: value for key, value in report.items() if key not in ("failures", "thresholds", "changes")})
     for stated in thresholds:
         known = counted(stated["distances"], "known distance")

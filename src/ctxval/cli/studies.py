@@ -53,10 +53,15 @@ def compare(
     picture = None if out_ is None else out_.with_suffix(".png")
     require_outputs({"--out .md": out_, "its picture": picture}, candidates, force=force)
     campaigns = _candidates(candidates, stores, seed, named_values(option))
-    how: dict[str, Any] = {"question": question, "budget": budget, "seed": seed}  # it refuses other questions
-    how |= {"confidence": CONFIDENCE if confidence is None else confidence}
-    how |= {"largest_possible": largest_possible, "stochastic": stochastic}
-    comparison = run_comparison(campaigns, **how)
+    comparison = run_comparison(
+        campaigns,
+        question=question,  # type: ignore[arg-type]  # it refuses other words
+        budget=budget,
+        confidence=CONFIDENCE if confidence is None else confidence,
+        seed=seed,
+        largest_possible=largest_possible,
+        stochastic=stochastic,
+    )
     failures = {name: base.failures_of(campaign.failed) for name, campaign in campaigns.items()}
     _print_comparison(comparison)
     for value in failures.values():
@@ -148,8 +153,16 @@ def refine_model(
         experiment = replace(opened.experiment, validation=validation, truth=None)
         return settings.model_copy(update=known).campaign(experiment, store)
 
-    how: dict[str, Any] = {"method": chosen, "certificate": settings.certificate_options, "open_round": open_round}
-    refinement = refine(opened.campaign, limit, budget, workers=workers, timeout=timeout, **how)
+    refinement = refine(
+        opened.campaign,
+        limit,
+        budget,
+        method=chosen,
+        certificate=settings.certificate_options,
+        open_round=open_round,
+        workers=workers,
+        timeout=timeout,
+    )
     _print_refinement(refinement)  # before the files are written, which may fail
     number = refinement.last.number
     files = [] if out_ is None or not number else write_refined(out_, refinement, function.step)

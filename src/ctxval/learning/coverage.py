@@ -178,10 +178,12 @@ def away_from_executions(
     Args:
         positions: of each position, the two states that are its coordinates.
     """
+    away = [np.zeros(each.states.shape[1]) for each in loops]
+    if not positions:
+        return away
     entered = _entered(executed)
     visited = np.concatenate([each.states[0].reshape(-1, entered.shape[1]) for each in of_pool])
     widths = np.ptp(np.quantile(visited[np.isfinite(visited).all(axis=1)], _MOSTLY, axis=0), axis=0)
-    away = [np.zeros(each.states.shape[1]) for each in loops]
     for two in map(list, positions):
         scale = max(float(widths[two].max()), 1e-9)
         tree = cKDTree(entered[:, two] / scale)
@@ -232,10 +234,13 @@ def position_states(
         same = [[*chain.from_iterable(map(np.flatnonzero, states))] for states in zip(*fits, strict=True)]
         if all(same):
             groups.append([int(states[0]) for states in same][:2])
-    for i, j in [] if groups else combinations(range(len(labels)), 2):
-        if are_coordinates_of_ground(labels[i], labels[j]):
-            spreads = [np.linalg.svd(end[:, [i, j]] - end[:, [i, j]].mean(axis=0), compute_uv=False) for end in ends]
-            groups += [[i, j]] if any(small > _FLAT * large for large, small in spreads) else []
+    if groups:
+        return groups
+    for two in map(list, combinations(range(len(labels)), 2)):
+        if are_coordinates_of_ground(*(labels[state] for state in two)):
+            spreads = [np.linalg.svd(end[:, two] - end[:, two].mean(axis=0), compute_uv=False) for end in ends]
+            if any(small > _FLAT * large for large, small in spreads):
+                groups.append(two)
     return groups
 
 

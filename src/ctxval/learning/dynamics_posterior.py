@@ -206,19 +206,23 @@ class DynamicsPosterior(ShortRepr):
     # Draws
 
     def draw(
-        self, relevant: Array, rng: np.random.Generator, functions: int | None = None, some: int | None = None
+        self,
+        relevant: Array,
+        rng: np.random.Generator,
+        functions: int | None = None,
+        hyperparameters: int | None = None,
     ) -> DynamicsDraws:
-        """Return so many functions, by default those of the settings, for some or all draws of the hyperparameters.
+        """Return so many functions, by default those of the settings, for so many or all draws of the hyperparameters.
 
         Closed loops visit the ``relevant`` standardised pairs ``(R, k)``.
         """
         settings = self.covariances.settings
         count = settings.functions if functions is None else functions
         with single_threaded():
-            if some is None:
+            if hyperparameters is None:
                 components = self.components
             else:  # about so many, evenly spread
-                rows = np.linspace(1, len(self.covariances.drawn) - 1, some - 1).astype(int)
+                rows = np.linspace(1, len(self.covariances.drawn) - 1, hyperparameters - 1).astype(int)
                 components = self._components(np.unique(rows).tolist())
             # Adjacent components of the same hyperparameters share their pivots and are evaluated together.
             groups = [list(group) for _, group in groupby(components, lambda component: id(component.factor))]

@@ -55,9 +55,13 @@ class ExtendedValidation:
     """
 
     def __init__(
-        self, given: Validation, actuator: Actuator | None = None, inputs: int = 0, known: StateEstimates | None = None
+        self,
+        given: Validation,
+        actuator: Actuator | None = None,
+        inputs: int = 0,
+        estimates: StateEstimates | None = None,
     ) -> None:
-        self.given, self.actuator, self.inputs, self._known = given, actuator, inputs, known
+        self.given, self.actuator, self.inputs, self._known = given, actuator, inputs, estimates
         self._acting = WeakKeyDictionary[Trajectory, Trajectory]()
         of_names = (np.arange(given.space.dimension)[given.space.columns(name)] for name in given.physical)
         self._columns = np.hstack([np.empty(0, dtype=np.intp), *of_names])

@@ -152,7 +152,10 @@ class NoisyPosterior(ShortRepr):
         """The variance of noise as a share of the mean square of a state's error of M, where it is largest."""
         return self.fit.share
 
-    deviations = property(lambda self: self.fit.noise)  # as those of a DynamicsPosterior, shape (n,)
+    @property
+    def deviations(self) -> Array:
+        """The learned standard deviations of the noise of each state in a step, shape ``(n,)``."""
+        return self.fit.noise
 
     @property
     def is_noisy(self) -> bool:
@@ -171,7 +174,10 @@ class NoisyPosterior(ShortRepr):
         few = replace(self.mean, rows=self.mean.rows[:, :ROUGH], start=self.mean.start[:, :ROUGH])
         return self.mean if self.mean.replicates <= ROUGH else few
 
-    rough_mean = property(lambda self: self.searched)  # nothing is cheaper and as good
+    @property
+    def rough_mean(self) -> NoisyDraws:
+        """What is searched; nothing is cheaper and as good."""
+        return self.searched
 
     @functools.cached_property
     def silent(self) -> NoisyDraws:
@@ -179,12 +185,16 @@ class NoisyPosterior(ShortRepr):
         return self.mean.without_noise() if self.is_noisy else self.mean
 
     def draw(
-        self, relevant: Array, rng: np.random.Generator, functions: int | None = None, some: int | None = None
+        self,
+        relevant: Array,
+        rng: np.random.Generator,
+        functions: int | None = None,
+        hyperparameters: int | None = None,
     ) -> NoisyDraws:
         """Return draws; see :meth:`DynamicsPosterior.draw`. Nothing depends on ``relevant``."""
         groups, each = _GROUPS, _FUNCTIONS if functions is None else functions
-        if some is not None:
-            groups, each = some // 2, 2 * each  # a few for a screening
+        if hyperparameters is not None:
+            groups, each = hyperparameters // 2, 2 * each  # a few for a screening
         return self._with_noise(self.fit.draw(groups, each, rng), rng)
 
     def _with_noise(self, drawn: Sequence[DrawnWeights], rng: np.random.Generator) -> NoisyDraws:

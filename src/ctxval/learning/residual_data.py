@@ -60,9 +60,19 @@ def residual_data(model: Model, transitions: Transitions, sources: Rows) -> Resi
     if not learned.any():
         return None
     shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
-    units, outputs = np.where(learned, sizes, 0.0), residuals / np.where(learned, sizes, np.inf)
-    constants = shift, scale, sizes, typical, learned, units, transitions.u.shape[1]
-    return ResidualData((pairs - shift) / scale, outputs, sources[usable], *constants, transitions[usable])
+    return ResidualData(
+        (pairs - shift) / scale,
+        residuals / np.where(learned, sizes, np.inf),
+        sources[usable],
+        shift,
+        scale,
+        sizes,
+        typical,
+        learned,
+        units=np.where(learned, sizes, 0.0),
+        inputs=transitions.u.shape[1],
+        transitions=transitions[usable],
+    )
 
 
 def smoother_than(data: ResidualData, count: int) -> tuple[Model, ResidualData] | None:

@@ -51,20 +51,28 @@ def check_experiment(
     run = plans[0].model_trajectory
     counts = {"states": run.states.shape[-1], "inputs": run.inputs.shape[-1]}
     of_model = {**counts, "states": plans[0].task.initial_state.shape[-1]}  # others if outputs are recorded
-    checks = {"controller on the model": _goals(validation, plans)}
-    checks |= {"convergence of the designs": _convergence_of(validation, plans), "names": _names(experiment, counts)}
-    checks |= {"system": _system(validation, plans[0], counts), "model": _model(validation, of_model)}
-    checks |= {"batches": _batches(validation, plans), "distance": _distance(experiment, plans)}
-    checks |= {"specification": _specification(spec, plans), "execution": _executions(validation, plans, execute)}
-    return findings + _checked(checks | {"cost": _cost(validation, plans)})
+    return findings + _checked(
+        {
+            "controller on the model": _goals(validation, plans),
+            "convergence of the designs": _convergence_of(validation, plans),
+            "names": _names(experiment, counts),
+            "system": _system(validation, plans[0], counts),
+            "model": _model(validation, of_model),
+            "batches": _batches(validation, plans),
+            "distance": _distance(experiment, plans),
+            "specification": _specification(spec, plans),
+            "execution": _executions(validation, plans, execute),
+            "cost": _cost(validation, plans),
+        }
+    )
 
 
 def _checked(checks: Mapping[str, Findings]) -> list[Checked]:
     """Return the findings of generators, each of which begins to check when it is asked for its first one."""
     findings = list[Checked]()
-    for name, found in checks.items():
+    for name, check in checks.items():
         try:
-            findings += [Checked(name, state, text) for state, text in found]
+            findings += [Checked(name, state, text) for state, text in check]
         except Exception as error:  # a user's own part may raise anything
             reason = str(error) if isinstance(error, CtxvalError) else reason_of(error)
             findings.append(Checked(name, "failed", reason))
@@ -258,9 +266,14 @@ def _cost(validation: Validation, plans: Sequence[Plan]) -> Findings:
 
 def aspect1_findings(report: Aspect1Report) -> list[Checked]:
     """Return what simulations of M show of its tasks and controllers, as sentences."""
-    checks = {"tasks on the model": _completion(report), "neighbouring tasks": _flips(report)}
-    checks |= {"limits of the inputs": _saturated(report)}
-    return _checked(checks | {"convergence of the designs": _convergence(report.not_converged, report.designs)})
+    return _checked(
+        {
+            "tasks on the model": _completion(report),
+            "neighbouring tasks": _flips(report),
+            "limits of the inputs": _saturated(report),
+            "convergence of the designs": _convergence(report.not_converged, report.designs),
+        }
+    )
 
 
 def _completion(report: Aspect1Report) -> Findings:

@@ -214,9 +214,15 @@ class Settings(BaseModel, extra="forbid"):
         self, experiment: Experiment, store: Store | Path, *, accept_change: str | None = None, remeasure: bool = False
     ) -> Campaign:
         """Return a campaign, and sign these settings in its store: later commands may run the code that they name."""
-        how: dict[str, Any] = {"accept_change": accept_change, "remeasure": remeasure, "name": experiment.name}
-        search = self.search.build(self.folder)
-        campaign = Campaign(experiment.validation, search=search, store=store, seed=self.seed, **how)
+        campaign = Campaign(
+            experiment.validation,
+            search=self.search.build(self.folder),
+            store=store,
+            seed=self.seed,
+            name=experiment.name,
+            accept_change=accept_change,
+            remeasure=remeasure,
+        )
         plain = self.model_dump(mode="json", exclude={"store", "aspect1"})
         if self.folder is None and code_named(plain):
             plain["folder"] = str(Path().resolve())  # the folder in which its code was found now
