@@ -209,3 +209,22 @@ def test_data_of_another_system_are_left_out(load: float) -> None:
     assert learned.with_data == (load == 0)
     assert bool((learned.posterior.data.sources == -1).any()) == (load == 0)
     assert learned.left_out_error < 0.2
+
+
+def test_values_of_a_parameter_that_changes_no_prediction_are_spread_over_its_range() -> None:
+    validation, task = loaded_cart(()), np.array([0.7, 0.9])
+    executed = [(point, validation.execute(validation.plan(point))) for point in np.array([[1.0, 0.2], [0.0, 0.8]])]
+    learned = DynamicsStudy(validation).learn(executed)
+    assert learned is not None
+    known = np.empty((0, 2))
+    for _ in range(5):
+        moved = learned.spread_unseen(task, known)
+        assert moved[0] == task[0]
+        known = np.vstack([known, moved])
+    np.testing.assert_array_equal(np.sort(known[:, 1]), [0.0, 0.25, 0.5, 0.75, 1.0])
+    # The dynamics that are learned with the load as a state depend on it, and so does the distance.
+    validation = loaded_cart()
+    executed = [(point, validation.execute(validation.plan(point))) for point, _ in executed]
+    learned = DynamicsStudy(validation).learn(executed)
+    assert learned is not None
+    np.testing.assert_array_equal(learned.spread_unseen(task, known), task)

@@ -265,6 +265,8 @@ class IntervalSearch:
             after = self.recorder.dynamics.screening(trials, pending=True) or evidence
             known = self._points([*trials, *failed])
             point = next_task(after, known, best, limit, confidence, steady, self._near)
+        if learned is not None and point is not None and self._suite is None:
+            point = learned.spread_unseen(point, known)
         return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
     # What is known

@@ -247,6 +247,24 @@ def position_states(
 # Corners
 
 
+def farthest_value(
+    known: Array, places: Array | None = None, rng: np.random.Generator | None = None
+) -> tuple[float, float]:
+    """Return the largest distance of a value in [0, 1], or of places ``(m,)``, from known ones ``(n,)``, and the value.
+
+    A generator chooses among values that are as far.
+    """
+    if not len(known):
+        return 1.0, 0.5
+    ordered = np.sort(known)
+    if places is None:  # the ends of the range, and the middles between neighbours
+        places = np.concatenate([[0.0], 0.5 * (ordered[1:] + ordered[:-1]), [1.0]])
+    away = np.abs(places[:, None] - ordered).min(axis=1)
+    farthest = np.flatnonzero(away >= away.max() - 1e-9)
+    chosen = int(farthest[0] if rng is None else rng.choice(farthest))
+    return float(away[chosen]), float(places[chosen])
+
+
 def untried_corner(executed: Array, space: TaskSpace, task: Array) -> UntriedCorner | None:
     """Return the corner that is farthest from executed tasks ``(n, d)``; None if no task parameter is a position.
 

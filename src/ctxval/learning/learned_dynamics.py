@@ -15,7 +15,14 @@ from ctxval.core.coverage import StateInputCoverage, StatePocket
 from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import AnyDraws, distances_of, loop_pairs
-from ctxval.learning.coverage import away_from_executions, beyond_records, coverage, largest_pocket, position_states
+from ctxval.learning.coverage import (
+    away_from_executions,
+    beyond_records,
+    coverage,
+    farthest_value,
+    largest_pocket,
+    position_states,
+)
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import SETTLED, NoisyDraws, NoisyPosterior
@@ -211,25 +218,29 @@ class LearnedDynamics(ShortRepr):
     @property
     def untried_parameter(self) -> tuple[int, float, Array] | None:
         """A parameter without effect on M's loops, its largest gap as a share of its range, and a task in the gap."""
-        members, gaps = self.study.validation.space.members, list[tuple[int, float, float]]()
-        for j in self.study.unseen_parameters:
-            ordered = np.sort(self.executed[:, j])
-            if not len(ordered):
-                gaps.append((j, 1.0, 0.5))
-                continue
-            if members is not None:
-                places = members[:, j]
-                away = np.abs(places[:, None] - ordered).min(axis=1)
-            else:  # the ends of the range, and the middles between neighbours
-                places = np.concatenate([[0.0], 0.5 * (ordered[1:] + ordered[:-1]), [1.0]])
-                away = np.concatenate([[ordered[0]], 0.5 * np.diff(ordered), [1 - ordered[-1]]])
-            gaps.append((j, float(away.max()), float(places[away.argmax()])))
+        members, executed = self.study.validation.space.members, self.executed
+        gaps = [
+            (j, *farthest_value(executed[:, j], None if members is None else members[:, j]))
+            for j in self.study.unseen_parameters
+        ]
         if not gaps:
             return None
         j, gap, value = max(gaps, key=lambda each: each[1])
         task = self.coverage.task.copy()
         task[j] = value
         return j, gap, task
+
+    def spread_unseen(self, task: Array, known: Array) -> Array:
+        """Return a task ``(d,)`` with values of the unseen parameters that are far from those of known ones ``(n, d)``.
+
+        What such a parameter changes in the system is met by no choice that follows predictions. Trying it costs no
+        execution of its own. The task stays the same if another distance is predicted for the moved one.
+        """
+        rng, moved = np.random.default_rng([self.study.seed, len(known)]), task.copy()
+        for j in self.study.unseen_parameters:
+            moved[j] = farthest_value(known[:, j], rng=rng)[1]
+        before, after = self.expected(np.stack([task, moved]))
+        return moved if np.isclose(after, before, rtol=0.05, atol=0) else task
 
     @property
     def coverage(self) -> StateInputCoverage:
