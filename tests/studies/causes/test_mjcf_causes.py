@@ -69,6 +69,18 @@ def test_a_changed_copy_leaves_the_model_as_it_is() -> None:
     np.testing.assert_allclose(pushed, model.step(x, np.array([0.6])), atol=1e-12)
 
 
+def test_the_load_of_the_gears_is_what_the_motor_and_gravity_push_against() -> None:
+    model, angles, torques = models.MuJoCo(mjcf(), dt=DT), np.array([0.4, -0.9, np.nan]), np.array([0.5, -0.2, 0.1])
+    friction = causes.LoadFriction((0.5, 0.01), Joint(1, 0, 1.0, 0, 0), 0.1, DT)
+    load = friction.load(model, np.stack([angles, 0 * angles], axis=-1), torques[:, None])
+    needed = 0.5 * 9.81 * 0.25 * np.sin(angles)  # to hold the link against gravity
+    np.testing.assert_allclose(load, np.abs(torques + needed), rtol=1e-6)
+    # A link at rest that friction can hold stays at rest.
+    held = causes.LoadFriction((2.0, 0.0), friction.joint, 0.1, DT)
+    repaired = causes.Repaired(model, (held,))
+    np.testing.assert_allclose(repaired.step(np.array([0.4, 0.0]), np.array([0.5])), [0.4, 0.0], atol=1e-6)
+
+
 def test_joints_and_units_are_those_of_the_model() -> None:
     rng, model = np.random.default_rng(0), models.MuJoCo(mjcf(), dt=DT)
     plant = plant_of(model, DT, {"x0": "", "x1": ""}, {"u0": ""}, rng.normal(size=(9, 2)), rng.normal(size=(9, 1)))
