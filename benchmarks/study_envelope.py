@@ -42,7 +42,16 @@ TASKS, NOISY_TASKS, REPEATS = 4000, 1000, 60
 
 SMOOTH = ("reactor", "heated-rooms", "boat-in-current", "ball-on-beam", "far-barge", "warm-bearing", "ground-effect")
 CONTACTS = ("table-top", "oblique-wall", "taut-tether")
-NOISY = {"ship, noise": ("ship", "process 0.1 %"), "tanks, noise": ("tanks", "measurement 0.5 %")}
+NOISY = {
+    "ship, noise": ("ship", "process 0.1 %"),
+    "tanks, noise": ("tanks", "measurement 0.5 %"),
+    "maglev, noise": ("maglev", "process 0.1 %"),
+    "cart-pole, noise": ("cart-pole", "measurement 0.5 %"),
+    "crane, noise": ("crane", "process 0.1 %"),
+    "quadrotor, noise": ("quadrotor", "measurement 0.5 %"),
+    "chain, noise": ("chain", "process 0.1 %"),
+    "arm, noise": ("arm", "measurement 0.5 %"),
+}
 SYSTEMS = (*SMOOTH, *CONTACTS, *NOISY)
 
 
