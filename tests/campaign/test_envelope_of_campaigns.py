@@ -39,7 +39,7 @@ def test_it_finds_the_true_set_after_a_falsification_and_includes_nothing_else(w
     assert envelope.doubt is None
     assert envelope.tests == 8
     assert envelope.executions == campaign.executions <= BUDGET
-    tasks = validation.space.iid(2000, np.random.default_rng(9))
+    tasks = validation.space.iid(500, np.random.default_rng(9))
     true, trusted = validation.distances(tasks), envelope.trusted(tasks)
     assert trusted[true <= tau].mean() > 0.9
     assert not trusted[true > tau].any()

@@ -248,12 +248,12 @@ def test_a_failure_cannot_be_dropped(store: Path) -> None:
     ids=repr,
 )
 def test_a_campaign_goes_on_with_the_search_that_its_store_was_made_with(tmp_path: Path, search: Any) -> None:
-    whole = Campaign(make_validation(), search=search, seed=2).run(6)
+    whole = Campaign(make_validation(), search=search, seed=2).run(5)
     Campaign(make_validation(), search=search, seed=2, store=tmp_path / "a.sqlite").run(4)
     resumed = Campaign(make_validation(), seed=2, store=tmp_path / "a.sqlite")
     assert type(resumed.search) is type(search)
     assert describe(resumed.search) == describe(search)
-    points = [[trial.unit_point.tolist() for trial in one.trials] for one in (resumed.run(6), whole)]
+    points = [[trial.unit_point.tolist() for trial in one.trials] for one in (resumed.run(5), whole)]
     assert points[0] == points[1]
 
 
