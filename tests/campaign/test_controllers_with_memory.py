@@ -47,7 +47,7 @@ def alone(controller: Any, task: Task) -> Trajectory:
 
 
 def truth() -> float:
-    return float(validation().distances(np.linspace(0.5, 2.0, 301)[:, None]).max())
+    return float(validation().distances(np.linspace(0.5, 2.0, 31)[:, None]).max())
 
 
 @pytest.mark.thorough
