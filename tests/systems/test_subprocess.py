@@ -329,7 +329,7 @@ def test_all_is_killed_when_we_are_interrupted(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.skipif(shutil.which("false") is None, reason="no false")
 def test_the_status_of_the_shortest_command_is_never_lost() -> None:
     system = Subprocess("false", timeout=30)
-    for _ in range(30):
+    for _ in range(15):
         with pytest.raises(ExecutionError, match="the command ended with status 1: nothing on stderr"):
             system.execute(designed(), TASK)
 
