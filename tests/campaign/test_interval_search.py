@@ -188,12 +188,12 @@ def decided(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
 @pytest.mark.slow
 def test_it_resumes_with_the_same_choices_and_the_same_predictions(tmp_path: Path) -> None:
     validation, largest = linear()
-    whole = Campaign(validation, seed=3).run(7, 1.1 * largest)
+    whole = Campaign(validation, seed=3).run(6, 1.1 * largest)
     store = tmp_path / "a.sqlite"
     for _ in range(20):
         pieces = Campaign(linear()[0], seed=3, store=store)
         try:
-            pieces.run(7, 1.1 * largest, on_trial=lambda trial: interrupt_at_once())
+            pieces.run(6, 1.1 * largest, on_trial=lambda trial: interrupt_at_once())
         except KeyboardInterrupt:
             continue
         break
