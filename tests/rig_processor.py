@@ -1,4 +1,4 @@
-"""A campaign on the processor that the environment names: ``python rig_processor.py STORE SEARCH BUDGET``.
+"""A campaign on the processor that the environment names: ``python rig_processor.py SEARCH BUDGET STORE ...``.
 
 ``OPENBLAS_CORETYPE`` chooses the kernels of linear algebra as another processor would.
 """
@@ -20,7 +20,8 @@ def kernels() -> str:
 
 
 if __name__ == "__main__":
-    store, search, budget = sys.argv[1:]
-    campaign = Campaign(make_validation(), search=searches.by_name(search), store=store, seed=1, name="processors")
-    campaign.run(int(budget), explore=True)
+    search, budget, *stores = sys.argv[1:]
+    for store in stores:
+        campaign = Campaign(make_validation(), search=searches.by_name(search), store=store, seed=1, name="processors")
+        campaign.run(int(budget), explore=True)
     print(kernels())

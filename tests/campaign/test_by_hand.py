@@ -669,9 +669,9 @@ def test_a_point_that_was_asked_for_twice_does_not_hinder_a_resumption(validatio
     campaign.tell(1, failed="x")
     campaign.ask({"goal": 1.0})
     campaign.tell(2, distance=1.0)
-    campaign.run(7)
+    campaign.run(4)
     again = Campaign(validation, store=tmp_path / "a.sqlite", seed=3)
-    np.testing.assert_array_equal(again.ask().trial.unit_point, campaign.reopen(8).trial.unit_point)
+    np.testing.assert_array_equal(again.ask().trial.unit_point, campaign.reopen(5).trial.unit_point)
 
 
 def test_an_execution_that_ended_early_is_no_whole_recording(validation: Any) -> None:

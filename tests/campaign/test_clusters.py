@@ -179,17 +179,17 @@ def facts(campaign: Campaign) -> list[tuple[object, ...]]:
 
 def test_random_tasks_wait_for_a_free_worker_and_are_the_same() -> None:
     queue = Queue(2)
-    campaign = random_campaign().run(40, executor=queue, workers=2)
+    campaign = random_campaign().run(24, executor=queue, workers=2)
     assert 2 < queue.waiting <= 18
-    assert (len(queue.jobs), campaign.executions) == (40, 40)
-    assert facts(campaign) == facts(random_campaign().run(40))
+    assert (len(queue.jobs), campaign.executions) == (24, 24)
+    assert facts(campaign) == facts(random_campaign().run(24))
 
 
 def test_tasks_of_an_audit_wait_for_a_free_worker() -> None:
     queue = Queue(2)
-    campaign = random_campaign().audit(40, executor=queue, workers=2)
+    campaign = random_campaign().audit(24, executor=queue, workers=2)
     assert 2 < queue.waiting <= 18
-    assert facts(campaign) == facts(random_campaign().audit(40))
+    assert facts(campaign) == facts(random_campaign().audit(24))
 
 
 @pytest.mark.parametrize(
@@ -223,11 +223,11 @@ def test_trials_are_stored_before_they_wait(tmp_path: Path) -> None:
 def test_what_waited_when_the_executor_ended_is_executed_later(tmp_path: Path) -> None:
     path = tmp_path / "a.sqlite"
     with pytest.raises(CampaignError, match="the executor takes no more work: RuntimeError: the queue is closed"):
-        random_campaign(path).run(30, executor=Queue(2, most=9), workers=2)
+        random_campaign(path).run(20, executor=Queue(2, most=9), workers=2)
     before = Store(path).trials()
     assert any(trial.state == "open" and trial.attempts for trial in before)
-    resumed = random_campaign(path).run(30, executor=Queue(2), workers=2)
-    assert facts(resumed) == facts(random_campaign().run(30))
+    resumed = random_campaign(path).run(20, executor=Queue(2), workers=2)
+    assert facts(resumed) == facts(random_campaign().run(20))
     assert all(resumed.trials[trial.number].attempts == 1 + (trial.state == "open") for trial in before)
 
 

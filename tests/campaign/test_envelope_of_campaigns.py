@@ -30,16 +30,23 @@ def whole() -> Campaign:
     return Campaign(validation, seed=2).run(BUDGET, threshold_of(validation), envelope=True)
 
 
+@pytest.fixture(scope="module")
+def envelope(whole: Campaign) -> certificates.Envelope:
+    """Its envelope at its threshold."""
+    return whole.envelope(threshold_of(whole.validation))
+
+
 @pytest.mark.slow
-def test_it_finds_the_true_set_after_a_falsification_and_includes_nothing_else(whole: Campaign) -> None:
+def test_it_finds_the_true_set_after_a_falsification_and_includes_nothing_else(
+    whole: Campaign, envelope: certificates.Envelope
+) -> None:
     campaign, validation = whole, whole.validation
     tau = threshold_of(validation)
     assert campaign.verdict(tau).answer == "falsified"
-    envelope = campaign.envelope(tau)
     assert envelope.doubt is None
     assert envelope.tests == 8
     assert envelope.executions == campaign.executions <= BUDGET
-    tasks = validation.space.iid(2000, np.random.default_rng(9))
+    tasks = validation.space.iid(500, np.random.default_rng(9))
     true, trusted = validation.distances(tasks), envelope.trusted(tasks)
     assert trusted[true <= tau].mean() > 0.9
     assert not trusted[true > tau].any()
@@ -51,12 +58,12 @@ def test_it_finds_the_true_set_after_a_falsification_and_includes_nothing_else(w
 
 @pytest.mark.slow
 def test_a_failure_beyond_the_threshold_is_outside_or_contradicts_it(
-    whole: Campaign, monkeypatch: pytest.MonkeyPatch
+    whole: Campaign, envelope: certificates.Envelope, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tau, space = threshold_of(whole.validation), whole.validation.space
     tasks = space.iid(200, np.random.default_rng(4))
     above = whole.validation.distances(tasks) > 1.5 * tau
-    trusted = whole.envelope(tau).trusted(tasks)
+    trusted = envelope.trusted(tasks)
 
     def with_failure(row: int, least: float) -> certificates.Envelope:
         stopped = replace(
@@ -64,9 +71,9 @@ def test_a_failure_beyond_the_threshold_is_outside_or_contradicts_it(
             unit_point=space.to_unit(tasks[row]), note={AT_LEAST: least},
         )  # fmt: skip
         monkeypatch.setattr(whole.recorder, "_trials", [*whole.trials, stopped])
-        envelope = EnvelopeSearch(IntervalSearch(whole.recorder, CertificateOptions(), BUDGET, tau)).envelope()
+        found = EnvelopeSearch(IntervalSearch(whole.recorder, CertificateOptions(), BUDGET, tau)).envelope()
         monkeypatch.undo()
-        return envelope
+        return found
 
     outside = with_failure(int(above.argmax()), 1.2 * tau)
     assert outside.doubt is None

@@ -38,10 +38,10 @@ def test_auto_goes_on_although_distances_were_told_without_trajectories(tmp_path
     for goal in (-2.0, 0.5, 2.5):
         opened = live.ask({"goal": goal})
         live.tell(opened, distance=validation.outcome([goal]).distance)
-    live.run(9, explore=True)
+    live.run(6, explore=True)
     resumed = campaign()
-    np.testing.assert_array_equal(resumed.ask().trial.unit_point, live.reopen(9).trial.unit_point)
-    assert len(np.unique([t.unit_point[0] for t in resumed.trials])) == 10
+    np.testing.assert_array_equal(resumed.ask().trial.unit_point, live.reopen(6).trial.unit_point)
+    assert len(np.unique([t.unit_point[0] for t in resumed.trials])) == 7
 
 
 def test_a_prediction_leaves_out_what_was_executed_at_a_point() -> None:

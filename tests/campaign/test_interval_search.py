@@ -177,15 +177,23 @@ def test_a_system_without_inputs_is_validated(batched: bool) -> None:
     assert verdict.certificate.upper_bound == pytest.approx(corners.max(), rel=0.01)
 
 
+@pytest.fixture(scope="module")
+def decided(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+    """A campaign that ended because it was decided, which the tests leave as it is."""
+    validation, largest = linear()
+    store = tmp_path_factory.mktemp("decided") / "a.sqlite"
+    return Campaign(validation, seed=2, store=store).run(30, 1.1 * largest)
+
+
 @pytest.mark.slow
 def test_it_resumes_with_the_same_choices_and_the_same_predictions(tmp_path: Path) -> None:
     validation, largest = linear()
-    whole = Campaign(validation, seed=3).run(7, 1.1 * largest)
+    whole = Campaign(validation, seed=3).run(6, 1.1 * largest)
     store = tmp_path / "a.sqlite"
     for _ in range(20):
         pieces = Campaign(linear()[0], seed=3, store=store)
         try:
-            pieces.run(7, 1.1 * largest, on_trial=lambda trial: interrupt_at_once())
+            pieces.run(6, 1.1 * largest, on_trial=lambda trial: interrupt_at_once())
         except KeyboardInterrupt:
             continue
         break
@@ -194,12 +202,10 @@ def test_it_resumes_with_the_same_choices_and_the_same_predictions(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_predictions_are_stored_before_executions_and_equal_those_computed_afterwards() -> None:
-    validation, largest = linear()
-    campaign = Campaign(validation, seed=1).run(12, 1.1 * largest)
-    dynamics = campaign.recorder.dynamics
-    stored = dynamics.evidence(campaign.trials, 0.95)
-    without = [replace(trial, note=None) for trial in campaign.trials]
+def test_predictions_are_stored_before_executions_and_equal_those_computed_afterwards(decided: Campaign) -> None:
+    dynamics = decided.recorder.dynamics
+    stored = dynamics.evidence(decided.trials, 0.95)
+    without = [replace(trial, note=None) for trial in decided.trials]
     anew = dynamics.evidence(without, 0.95)
     assert stored is not None
     assert anew is not None
@@ -240,15 +246,14 @@ def test_an_anytime_audit_ends_as_soon_as_its_volume_is_small_enough() -> None:
 
 
 @pytest.mark.slow
-def test_eight_drawn_tasks_are_executed_before_a_model_is_validated() -> None:
+def test_eight_drawn_tasks_are_executed_before_a_model_is_validated(decided: Campaign) -> None:
     validation, largest = linear()
     untested = CertificateOptions(Automatic(tests=0))
     plain = Campaign(validation, seed=2).run(12, 1.1 * largest, certificate=untested)
-    tested = Campaign(validation, seed=2).run(30, 1.1 * largest)
-    assert tested.executions <= plain.executions + TESTS
-    assert sum(trial.origin in DRAWN for trial in tested.trials) == TESTS
-    assert all(PREDICTION in (trial.note or {}) for trial in tested.trials if trial.origin in DRAWN)
-    assert tested.verdict(1.1 * largest).answer == "validated"
+    assert decided.executions <= plain.executions + TESTS
+    assert sum(trial.origin in DRAWN for trial in decided.trials) == TESTS
+    assert all(PREDICTION in (trial.note or {}) for trial in decided.trials if trial.origin in DRAWN)
+    assert decided.verdict(1.1 * largest).answer == "validated"
     by_model = plain.verdict(1.1 * largest, certificate=untested)
     assert by_model.answer == "validated"
     assert "The bound would survive a further error of M" in str(by_model)
@@ -258,11 +263,11 @@ def test_eight_drawn_tasks_are_executed_before_a_model_is_validated() -> None:
 @pytest.mark.slow
 def test_after_many_executions_of_a_search_the_tests_alone_are_missing() -> None:
     validation = cases.by_name("linear", 0, dim=2).validation
-    campaign = Campaign(validation, seed=0).run(17, explore=True)
+    campaign = Campaign(validation, seed=0).run(12, explore=True)
     assert campaign.worst is not None
     threshold = 1.3 * (campaign.worst.distance or 0.0)
     campaign.run(30, threshold)
-    assert campaign.executions == 17 + TESTS
+    assert campaign.executions == 12 + TESTS
     assert campaign.verdict(threshold).answer == "validated"
 
 
@@ -427,7 +432,7 @@ def test_what_is_learned_of_the_same_executions_is_learned_once(monkeypatch: pyt
         return condition(covariances, transitions, rows)
 
     monkeypatch.setattr(dynamics_study, "condition", counted)
-    validation, largest = linear(2)
+    validation, largest = linear()
     campaign = Campaign(validation).run(18, 1.1 * largest)
     assert campaign.verdict(1.1 * largest).answer == "validated"
     assert campaign.ask() is not None  # the search predicts by the same posterior
@@ -450,14 +455,14 @@ def test_before_a_bound_is_possible_nothing_but_the_mean_is_searched() -> None:
 
 
 @pytest.mark.slow
-def test_a_decided_campaign_that_is_run_again_computes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_decided_campaign_that_is_run_again_computes_nothing(
+    decided: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
     validation, largest = linear()
-    store = tmp_path / "a.sqlite"
-    first = Campaign(validation, store=store).run(24, 1.1 * largest)
-    verdict = first.verdict(1.1 * largest)
+    verdict = decided.verdict(1.1 * largest)
     monkeypatch.setattr(dynamics_study.DynamicsStudy, "learn", lambda *_: pytest.fail("it learned again"))
-    again = Campaign(linear()[0], store=store).run(24, 1.1 * largest)
-    assert facts(again) == facts(first)
+    again = Campaign(validation, seed=2, store=decided.store.path).run(30, 1.1 * largest)
+    assert facts(again) == facts(decided)
     assert again.verdict(1.1 * largest).to_json() == verdict.to_json()
 
 

@@ -87,7 +87,7 @@ def test_without_trajectories_in_mind_the_search_chooses_the_first_tasks_itself(
 def test_workers_never_run_the_same_task_at_the_same_time(seed: int) -> None:
     validation = linear(2, seed)
     pool = Pool(validation, 4, seed)
-    found = points(run(Campaign(validation, search=searches.Auto("fast"), seed=seed), pool, 12))
+    found = points(run(Campaign(validation, search=searches.Auto("fast"), seed=seed), pool, 9))
     for together in pool.together:
         gaps = np.abs(found[together][:, None] - found[together]).max(axis=2) + np.eye(len(together))
         assert gaps.min() > NEAR
@@ -96,9 +96,9 @@ def test_workers_never_run_the_same_task_at_the_same_time(seed: int) -> None:
 def test_spare_workers_that_decide_execute_different_tasks() -> None:
     validation = linear(2)
     pool, campaign = Pool(validation, 4), Campaign(validation, search=searches.Auto("fast"))
-    decides = IntervalSearch(campaign.recorder, CertificateOptions.or_automatic(None, 0.95, 0.1), 10)
+    decides = IntervalSearch(campaign.recorder, CertificateOptions.or_automatic(None, 0.95, 0.1), 8)
     with campaign.recorder.predicting(decides.predicts):
-        found = points(run(campaign, pool, 10, decides.choose))
+        found = points(run(campaign, pool, 8, decides.choose))
     for together in pool.together:
         gaps = np.abs(found[together][:, None] - found[together]).max(axis=2) + np.eye(len(together))
         assert gaps.min() > NEAR
@@ -112,7 +112,7 @@ def test_a_choice_is_a_function_of_the_history(tmp_path: Path, seed: int) -> Non
     validation = linear(1, seed)
     campaign = Campaign(validation, search=searches.Auto("fast"), seed=seed, store=path)
     waiting = []
-    for step in range(7):
+    for step in range(5):
         copy = tmp_path / f"{step}.sqlite"
         shutil.copyfile(path, copy)
         again = Campaign(linear(1, seed), search=searches.Auto("fast"), seed=seed, store=copy).ask()

@@ -70,12 +70,17 @@ def test_a_store_keeps_it_and_refuses_another_one(tmp_path: Path) -> None:
         Campaign(make_validation(), search=searches.Random(), seed=2, store=tmp_path / "a.sqlite")
 
 
+@pytest.fixture(scope="module")
+def drawn() -> Campaign:
+    """A campaign of independent draws, to which the tests add nothing."""
+    return Campaign(narrow(), search=searches.Random(), seed=2).run(40)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [Audit(), AnytimeAudit(), Scenario(), SamplingDiscarding(2), Region()])
-def test_every_text_says_that_a_volume_is_a_probability_under_it(kind: CertificateKind) -> None:
-    campaign = Campaign(narrow(), search=searches.Random(), seed=2).run(40)
-    accepted = campaign.verdict(1e3, certificate=CertificateOptions(kind, volume=0.4))
-    refused = campaign.verdict(1e3, certificate=CertificateOptions(kind, volume=0.01))
+def test_every_text_says_that_a_volume_is_a_probability_under_it(kind: CertificateKind, drawn: Campaign) -> None:
+    accepted = drawn.verdict(1e3, certificate=CertificateOptions(kind, volume=0.4))
+    refused = drawn.verdict(1e3, certificate=CertificateOptions(kind, volume=0.01))
     assert accepted.answer == "validated"
     assert accepted.certificate is not None
     for text in (accepted.reason, refused.reason, accepted.certificate.statement):

@@ -19,6 +19,7 @@ import pytest
 from conftest import interrupt_at_once, make_validation
 from ctxval import Campaign, Store, Trajectory, searches
 from ctxval.errors import DesignError, DistanceError, ExecutionError, InputError, StoreAccessError
+from rig_cli import SMALL
 
 HERE = Path(__file__).parents[1]
 PLAIN = make_validation()
@@ -129,7 +130,7 @@ def test_run_ends_with_a_report_if_the_system_leaves_hard(tmp_path: Path) -> Non
         """)
     )
     done = subprocess.run(
-        [sys.executable, "-m", "ctxval", "run", "rig:experiment", "--budget", "2", "--no-report", "--json"],
+        [*SMALL, "run", "rig:experiment", "--budget", "2", "--no-report", "--json"],
         capture_output=True,
         text=True,
         cwd=tmp_path,

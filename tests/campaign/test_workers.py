@@ -246,7 +246,7 @@ import os, signal
 from multiprocessing.util import Finalize
 from pathlib import Path
 from conftest import make_validation
-from ctxval import Campaign
+from ctxval import Campaign, searches
 
 pid = os.getpid
 
@@ -264,7 +264,7 @@ class System:
         raise RuntimeError
 
 try:
-    Campaign(make_validation(system=System())).run(2, workers=2)
+    Campaign(make_validation(system=System()), search=searches.Random()).run(2, workers=2)
 finally:
     print("campaign left", flush=True)
 """

@@ -97,7 +97,7 @@ def test_a_state_that_is_not_finite_or_at_which_mujoco_warns_has_no_next_state(
 def test_it_is_the_model_of_a_campaign_and_repeats_itself_in_a_store(tmp_path: Path) -> None:
     validation = Validation(
         space=TaskSpace(goal=(-1.0, 1.0, "rad")),
-        task=lambda p: Task([0.0, 0.0], goal=[p.goal, 0.0], horizon=20, dt=DT),
+        task=lambda p: Task([0.0, 0.0], goal=[p.goal, 0.0], horizon=10, dt=DT),
         system=systems.MuJoCo(mjcf(0.08), substeps=4),
         model=models.MuJoCo(mjcf(0.02), dt=DT),
         synthesizer=controllers.LQR([1.0, 0.1], [0.1]),

@@ -97,7 +97,7 @@ def test_a_controller_that_flips_is_named_with_two_neighbours() -> None:
         side = np.where(task.goal[..., :1] < 1.2345, -1.0, 1.0)
         return side * np.sin(0.1 * t) * np.ones_like(x[..., :1])
 
-    report = aspect1.check(cart(controllers.Policy(policy)), tasks=60)
+    report = aspect1.check(cart(controllers.Policy(policy)), tasks=30)
     assert report.flips is not None
     assert report.flips.flipped > 0
     assert report.flipped is not None
@@ -183,7 +183,7 @@ def test_nonsense_is_refused(wrong: dict[str, Any]) -> None:
 
 
 def test_a_check_is_the_same_again_and_takes_any_search() -> None:
-    first, second = (aspect1.check(cart(), tasks=12, seed=3).to_json() for _ in range(2))
+    first, second = (aspect1.check(cart(), tasks=8, seed=3).to_json() for _ in range(2))
     assert first == second
     assert len(aspect1.check(cart(), tasks=8, search=Random()).simulated) == 8
 

@@ -15,7 +15,7 @@ from ctxval.errors import InputError
 from ctxval.studies.survey import Survey, survey
 from rig_logs import run, write_bag, write_control_desk, write_lerobot, write_mat, write_mcap_ros2, write_parquet
 
-RUNS = [run(160, seed) for seed in range(4)]
+RUNS = [run(60, seed) for seed in range(4)]
 
 
 def csv_file(path: Path, one: Trajectory, names: str = "time;position;speed;force", decimal: str = ",") -> None:

@@ -10,6 +10,7 @@ import sqlite3
 import struct
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -18,7 +19,7 @@ from typer.testing import CliRunner
 
 from conftest import make_validation
 from ctxval import Campaign, Store, searches
-from ctxval.campaign.storage import schema
+from ctxval.campaign.storage import recovery, schema
 from ctxval.campaign.storage.recovery import recover
 from ctxval.cli import app
 from ctxval.errors import CtxvalError, ForeignStoreError, StoreAccessError
@@ -45,6 +46,12 @@ def edit(path: Path, *statements: str) -> None:
     for statement in statements:
         connection.execute(statement)
     connection.close()
+
+
+@pytest.fixture(autouse=True)
+def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give no time to a process that might be writing a journal: here, none is."""
+    monkeypatch.setattr(recovery, "time", SimpleNamespace(sleep=lambda seconds: None))
 
 
 def said(path: Path, *command: str) -> str:

@@ -24,7 +24,7 @@ def mjcf(joint: str = "", mass: float = 0.5, gear: float = 1.0) -> str:
 
 
 def reach(p: Parameters) -> Task:
-    return Task(np.stack([p.start, 0 * p.start], axis=-1), goal=[p.goal, 0.0], horizon=30, dt=DT)
+    return Task(np.stack([p.start, 0 * p.start], axis=-1), goal=[p.goal, 0.0], horizon=15, dt=DT)
 
 
 def report(true: str) -> CauseReport:
