@@ -21,7 +21,14 @@ from browser import accessibility_findings
 
 ROOT = Path(__file__).parents[1]
 GALLERY = sorted((ROOT / "examples" / "gallery").glob("plot_*.py"))
-LONG = ("plot_1_pendulum_noisy", "plot_3_dubins", "plot_6_aspect1", "plot_6_comparison", "plot_6_refine")
+LONG = (
+    "plot_1_pendulum_noisy",
+    "plot_3_dubins",
+    "plot_4_linear",
+    "plot_6_aspect1",
+    "plot_6_comparison",
+    "plot_6_refine",
+)
 """Scripts that only `make docs` and `make thorough` run."""
 NEEDS = {"plot_2_arm": "mujoco", "plot_7_replay": "mcap", "plot_8_fit": "onnx"}
 BUILT = ("_build", "api", "auto_examples", "__pycache__")

@@ -175,7 +175,7 @@ def test_random_functions_have_the_kernel_they_are_drawn_from() -> None:
 def test_noise_belongs_to_the_task_and_averages_are_over_realisations() -> None:
     found = ENTRIES["noisy-oven"](0).validation
     assert isinstance(found.system, Noisy)
-    points = found.space.iid(300, np.random.default_rng(0))
+    points = found.space.iid(30, np.random.default_rng(0))
     np.testing.assert_array_equal(found.distances(points), found.distances(points))
     plan = found.plan(points[0])
     quiet = Noisy(found.system.step, (0.0, 0.0), 0).execute(plan.controller, plan.task)

@@ -150,8 +150,8 @@ def adaptive(hyper: Hyperparameters, rng: np.random.Generator, n: int = 10) -> t
     return GRID[rows], path[rows]
 
 
-def surprises(hyper: Hyperparameters, assumed: Hyperparameters) -> list[float]:
-    drawn = [adaptive(hyper, np.random.default_rng([4, seed])) for seed in range(250)]
+def surprises(hyper: Hyperparameters, assumed: Hyperparameters, count: int = 250) -> list[float]:
+    drawn = [adaptive(hyper, np.random.default_rng([4, seed])) for seed in range(count)]
     return [diagnose([condition(assumed, X, y)], X).surprise for X, y in drawn]
 
 
@@ -172,7 +172,7 @@ def test_of_independent_values_the_surprise_is_the_t_tests_of_each_against_those
 @pytest.mark.slow
 def test_surprises_of_another_process_are_not() -> None:
     rough = Hyperparameters(1.5, np.array([np.log(0.02)]), float(np.log(EXACT)))
-    assert kstest(surprises(rough, KNOWN), "uniform").pvalue < 1e-6
+    assert kstest(surprises(rough, KNOWN, 150), "uniform").pvalue < 1e-6
 
 
 def spiked(height: float) -> tuple[np.ndarray, np.ndarray]:

@@ -34,7 +34,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
-from scipy.special import gammaln, logsumexp
+from scipy.special import gammaln
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
@@ -88,7 +88,9 @@ class KnownStatistics:
     def log_density(self, value: Array) -> Array:
         """Return the logarithm of the predictive density of the logarithm of the next value ``(...)``."""
         after = self.with_value(value)
-        return np.asarray(logsumexp(after._log_evidence(), axis=-1) - logsumexp(self._log_evidence(), axis=-1))
+        return np.asarray(
+            np.logaddexp.reduce(after._log_evidence(), axis=-1) - np.logaddexp.reduce(self._log_evidence(), axis=-1)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,12 +219,12 @@ class WatchedChannel(ShortRepr):
         """Return the logarithm of the sum over all starts, and the run, counted from 1, at which it is likeliest."""
         if self._scales is None:
             return -math.inf, 1
-        of_starts = logsumexp(self._scales.products, axis=0) - math.log(len(SCALES))
+        of_starts = np.logaddexp.reduce(self._scales.products, axis=0) - math.log(len(SCALES))
         if self._slopes is not None:
-            of_slopes = logsumexp(self._slopes.products, axis=0) - math.log(len(WIDER))
+            of_slopes = np.logaddexp.reduce(self._slopes.products, axis=0) - math.log(len(WIDER))
             of_starts = np.logaddexp(of_starts, of_slopes) - math.log(2)
         known = [k for k, statistic in enumerate(self.later) if statistic is not None][-len(of_starts) :]
-        return float(logsumexp(of_starts)), known[int(of_starts.argmax())] + 1
+        return float(np.logaddexp.reduce(of_starts)), known[int(of_starts.argmax())] + 1
 
     def ratio(self, since: int) -> float:
         """Return how many times as large as those certified the statistics are since a run, in root mean squares."""
@@ -250,7 +252,7 @@ class WatchState(ShortRepr):
         channels = tuple(channel.after(statistics.get(channel.name)) for channel in self.channels)
         of_channels = [channel.evidence() for channel in channels]
         logs = np.array([log for log, _ in of_channels])
-        evidence = math.exp(min(700.0, float(logsumexp(logs)) - math.log(len(logs))))
+        evidence = math.exp(min(700.0, float(np.logaddexp.reduce(logs)) - math.log(len(logs))))
         runs, distances = (*self.runs, run), (*self.distances, distance)
         after = replace(self, channels=channels, runs=runs, distances=distances, evidence=evidence)
         if self.expired:
