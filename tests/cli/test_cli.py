@@ -19,6 +19,7 @@ from conftest import make_validation
 from ctxval import Campaign, Store, TaskSpace, Validation, __version__, searches
 from ctxval.cli import app
 from ctxval.cli.commands import MODULES, PANELS, TEXTS
+from rig_thorough import more
 
 EXPERIMENT = """
 import sys
@@ -329,8 +330,9 @@ def of_kind(campaigns: dict[str, Path], case: str, kind: str) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["pendulum", "linear"])
-@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize(
+    ("case", "kind"), [*(("linear", kind) for kind in KINDS), *more(*(("pendulum", kind) for kind in KINDS))]
+)
 def test_every_kind_certifies_stored_campaigns(invoke, campaigns: dict[str, Path], case: str, kind: str) -> None:  # type: ignore[no-untyped-def]
     volume = () if kind == "posterior" else ("--volume", "0.5")
     result = invoke(*of_kind(campaigns, case, kind), *volume, "--threshold", "90", "--confidence", "0.9", "--json")
@@ -486,6 +488,7 @@ def test_a_scenario_bound_of_a_budget_that_was_raised_is_refused(invoke) -> None
 
 @pytest.mark.slow
 def test_a_run_names_what_its_verdict_rests_on_and_the_other_campaigns(invoke) -> None:  # type: ignore[no-untyped-def]
+    invoke("run", "rig:experiment", "--budget", "7")  # each later execution needs a bound
     arguments = ("run", "rig:experiment", "--budget", "12", "--threshold", "90", "--resolution", "0.6", "--tests", "0")
     arguments += ("--decide",)
     alone = invoke(*arguments)

@@ -27,7 +27,7 @@ goal = [-2.0, 2.0, "m"]
 [task]
 initial_state = [0.0, 0.0]
 goal = ["goal", 0.0]
-horizon = 40
+horizon = 20
 dt = 0.05
 [system]
 type = "Simulated"

@@ -131,9 +131,9 @@ def test_a_model_is_a_file_a_reference_or_that_of_an_experiment(invoke: Invoke) 
     np.savez("model.npz", A=A, B=B)
     Path("my_model.py").write_text(f"from ctxval import models\nmodel = models.Linear({A.tolist()}, {B.tolist()})\n")
     Path("cart.toml").write_text(EXPERIMENT)
-    expected = report(invoke("logs", *LINEAR, "--json"))["errors"]
+    expected = report(invoke("logs/0.csv", *LINEAR, "--json"))["errors"]
     for model in ("model.npz", "my_model:model", "cart.toml"):
-        assert report(invoke("logs", "--model", model, "--json"))["errors"] == expected, model
+        assert report(invoke("logs/0.csv", "--model", model, "--json"))["errors"] == expected, model
 
 
 @pytest.mark.thorough

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ LARGEST = 300_000
 """Bytes of a page; it does not grow with the recordings."""
 
 
+@functools.cache
 def report(seeds: int = 3, steps: int = 60) -> ReplayReport:
     logs = [
         MemoryTable(f"run{seed}.csv", {"t": one.times, "x": one.states, "u": one.inputs})

@@ -8,6 +8,7 @@ import signal
 import time
 import zipfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlencode
 
@@ -427,8 +428,9 @@ def test_the_choices_are_those_of_the_command_line(tmp_path: Path, how: str, opt
         assert one.note == other.note
 
 
-def test_other_computers_need_the_token_and_a_name_can_be_allowed(tmp_path: Path) -> None:
+def test_other_computers_need_the_token_and_the_store_may_be_run_elsewhere(tmp_path: Path) -> None:
     new_store(tmp_path)
+    elsewhere = Store.existing(tmp_path / "a.sqlite")
     allowed = ("--allow-host", "rig.example", "--threshold", "0.5")
     with serving(tmp_path, "--host", "0.0.0.0", *allowed) as server:
         token = server.address.partition("?token=")[2]
@@ -451,27 +453,7 @@ def test_other_computers_need_the_token_and_a_name_can_be_allowed(tmp_path: Path
         named = server.request("GET", "/", Host="rig.example", Cookie=entered.cookie)
         assert (named.status, "0.5 m" in wait_for(server, "against 0.5 m", entered)) == (200, True)
 
-
-def test_the_server_ends_at_once_although_a_task_is_being_chosen(tmp_path: Path) -> None:
-    new_store(tmp_path, "my_rig:slow")
-    recording = record(tmp_path / "a.trials" / "0", tmp_path / "run.csv").read_bytes()
-    with serving(tmp_path) as server:
-        page = server.request("GET", "/")
-        assert upload(server, 0, page, recording).status == 303
-        assert post(server, "/choose", page, {"how": "next", "seen": "1"}).status == 303
-        wait_for(server, "choosing a task", page)
-        server.process.send_signal(signal.SIGINT)
-        time.sleep(0.2)
-        status, _ = server.stop()
-    assert status in (130, -signal.SIGINT)  # the second one may come when Python itself is ending
-    assert [trial.state for trial in trials(tmp_path)] == ["completed"]
-
-
-def test_a_store_that_is_run_elsewhere_stays_usable(tmp_path: Path) -> None:
-    new_store(tmp_path)
-    elsewhere = Store.existing(tmp_path / "a.sqlite")
-    with serving(tmp_path) as server:
-        page = server.request("GET", "/")
+        page = replace(page, headers={**page.headers, "set-cookie": entered.headers["set-cookie"]})
         with elsewhere.sole_writer():
             assert post(server, "/choose", page, {"how": "next", "seen": "1"}).status == 303
             found = wait_for(server, "waiting for another process that is running the store", page)
@@ -480,4 +462,14 @@ def test_a_store_that_is_run_elsewhere_stays_usable(tmp_path: Path) -> None:
         wait_for(server, 'id="trial-1"', page)
         ctxval("tell", "a.sqlite", "1", "--failed", "the cable broke", folder=tmp_path)
         wait_for(server, "the cable broke", page)
+
+        # The server ends at once although a task is being chosen.
+        with elsewhere.sole_writer():
+            assert post(server, "/choose", page, {"how": "next", "seen": "2"}).status == 303
+            wait_for(server, "waiting for another process that is running the store", page)
+            server.process.send_signal(signal.SIGINT)
+            time.sleep(0.2)
+            status, _ = server.stop()
+    assert status in (130, -signal.SIGINT)  # the second one may come when Python itself is ending
     elsewhere.close()
+    assert [trial.state for trial in trials(tmp_path)] == ["completed", "failed"]

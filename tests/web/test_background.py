@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,12 +22,10 @@ WAIT = 120
 """Seconds to wait for a process."""
 
 
-def open_nothing() -> Any:
+def open_if_it_exists(path: Path) -> Any:
+    if not path.exists():
+        raise InputError("there is no such experiment.")
     return "opened"
-
-
-def refuse() -> Any:
-    raise InputError("there is no such experiment.")
 
 
 def own_process(served: Any, *arguments: Any) -> tuple[Any, ...]:
@@ -53,13 +53,19 @@ def stages() -> list[Progress]:
 
 
 @pytest.fixture
-def process(stages: list[Progress]) -> Iterator[BackgroundProcess]:
-    made = BackgroundProcess(open_nothing, stages.append)
+def process(stages: list[Progress], tmp_path: Path) -> Iterator[BackgroundProcess]:
+    made = BackgroundProcess(functools.partial(open_if_it_exists, tmp_path / "campaign"), stages.append)
     yield made
     made.close()
 
 
-def test_jobs_run_one_after_the_other_in_one_other_process(process: BackgroundProcess, stages: list[Progress]) -> None:
+def test_jobs_run_in_one_other_process_that_survives_their_errors_and_is_started_again_if_it_dies(
+    process: BackgroundProcess, stages: list[Progress], tmp_path: Path
+) -> None:
+    with pytest.raises(CampaignError, match=r"there is no such experiment\."):
+        process.submit(own_process).result(WAIT)
+    (tmp_path / "campaign").touch()
+    stages.clear()
     first, second = (process.submit(own_process, number) for number in (1, 2))
     served, child, number = first.result(WAIT)
     assert (served, number) == ("opened", 1)
@@ -67,33 +73,19 @@ def test_jobs_run_one_after_the_other_in_one_other_process(process: BackgroundPr
     assert second.result(WAIT) == ("opened", child, 2)
     assert [each.stage for each in stages[:2]] == ["loading the experiment", "working"]
 
-
-def test_a_job_that_fails_is_an_error_and_the_next_one_runs(process: BackgroundProcess) -> None:
     with pytest.raises(CampaignError, match="KeyboardInterrupt"):
         process.submit(fail).result(WAIT)
-    assert process.submit(own_process).result(WAIT)[0] == "opened"
+    assert process.submit(own_process).result(WAIT) == ("opened", child)
 
-
-def test_a_process_that_dies_is_an_error_and_is_started_again(process: BackgroundProcess) -> None:
-    before = process.submit(own_process).result(WAIT)[1]
     with pytest.raises(CampaignError, match=r"ended with the status -9\. Try again\."):
         process.submit(die).result(WAIT)
-    assert process.submit(own_process).result(WAIT)[1] != before
+    again = process.submit(own_process).result(WAIT)[1]
+    assert again != child
 
-
-def test_a_campaign_that_cannot_be_opened_is_an_error_of_the_job() -> None:
-    process = BackgroundProcess(refuse, lambda stage: None)
-    with pytest.raises(CampaignError, match=r"there is no such experiment\."):
-        process.submit(own_process).result(WAIT)
-    process.close()
-
-
-def test_closing_ends_the_process_at_once(process: BackgroundProcess, stages: list[Progress]) -> None:
-    child = process.submit(own_process).result(WAIT)[1]
     waiting = process.submit(wait)
     while "waiting" not in [each.stage for each in stages]:
         time.sleep(0.01)
     process.close()
     assert waiting.exception(10) is not None
     with pytest.raises(ProcessLookupError):
-        os.kill(child, 0)
+        os.kill(again, 0)

@@ -107,23 +107,80 @@ def address(folder: Path) -> Iterator[str]:
         yield server.address
 
 
-def test_a_whole_campaign_by_hand(browser: Any, folder: Path, address: str) -> None:
-    one = Operator(browser, folder, address, accept_downloads=True)
-    for number in range(4):
-        assert (one.opened() if number == 0 else one.choose() if number < 3 else one.draw()) == number
-        recording = record(one.files(number), folder / f"run{number}.csv")
-        one.upload(number, recording)
-        assert re.search(rf"Trial {number} has the distance 0\.\d+ m\.", one.message())
-        one.page.locator("#verdict .work").wait_for(state="detached", timeout=WAIT)
-    assert one.page.locator(".answer").inner_text() == "validated against 2 m"
-    assert "95 % probability" in one.page.locator("#verdict").inner_text()
-    assert one.page.locator("#choosing .done").inner_text().startswith("The verdict is reached: validated.")
-    assert one.page.locator("#choosing .problem").count() == 0
-    assert one.page.locator("#verdict img").evaluate_all("all => all.map((one) => one.naturalWidth > 0)") == [True] * 2
-    assert one.page.locator("#trials tbody tr").count() == 4
-    assert accessibility_findings(one.page) == []
-    assert one.errors == []
+def test_a_whole_campaign_by_hand_of_two_operators_and_a_phone(browser: Any, folder: Path, address: str) -> None:
+    first = Operator(browser, folder, address, accept_downloads=True)
+    second = Operator(browser, folder, address, accept_downloads=True)
+    number = first.opened()
+    assert number == 0
+    recording = record(first.files(number), folder / "run.csv")
+    second.opened()
+    loses_and_doubles_nothing(first, second, recording)
+    for number in (1, 2, 3):
+        if number > 1:
+            assert (first.choose() if number < 3 else first.draw()) == number
+        first.upload(number, record(first.files(number), folder / f"run{number}.csv"))
+        assert re.search(rf"Trial {number} has the distance 0\.\d+ m\.", first.message())
+        first.page.locator("#verdict .work").wait_for(state="detached", timeout=WAIT)
+    assert first.page.locator(".answer").inner_text() == "validated against 2 m"
+    assert "95 % probability" in first.page.locator("#verdict").inner_text()
+    assert first.page.locator("#choosing .done").inner_text().startswith("The verdict is reached: validated.")
+    assert first.page.locator("#choosing .problem").count() == 0
+    pictures = first.page.locator("#verdict img").evaluate_all("all => all.map((one) => one.naturalWidth > 0)")
+    assert pictures == [True] * 2
+    assert first.page.locator("#trials tbody tr").count() == 4
+    assert accessibility_findings(first.page) == []
+    assert first.errors == []
     assert [trial.state for trial in stored(folder)] == ["completed"] * 4
+
+    for one in (first, second):
+        one.context.close()
+    ctxval("ask", "a.sqlite", "--explore", folder=folder)
+    ctxval("tell", "a.sqlite", "4", "--distance", "3", folder=folder)
+    ctxval("ask", "a.sqlite", "--explore", folder=folder)
+    phone = Operator(browser, folder, address, viewport={"width": 400, "height": 800}, color_scheme="dark")
+    phone.opened()
+    phone.page.locator(".answer").get_by_text("falsified").wait_for(timeout=WAIT)
+    fits_and_is_accessible(phone)
+
+
+def loses_and_doubles_nothing(first: Operator, second: Operator, recording: Path) -> None:
+    """Check what both see who report one trial, and what one sees who fills a form while the other one chooses."""
+    number = 0
+    with second.page.expect_file_chooser() as chooser:
+        second.trial(number).get_by_label(f"Recording of trial {number}").click()
+    chooser.value.set_files(recording)
+    first.upload(number, recording)
+    assert re.search(r"Trial 0 has the distance 0\.\d+ m\.", first.message())
+    told = second.trial(number).get_by_role("alert")
+    told.wait_for(timeout=WAIT)
+    assert told.inner_text() == "This trial has ended in the meantime: a result of it is recorded already."
+    with second.page.expect_navigation():
+        second.trial(number).get_by_role("button", name="Check and store the recording").click()
+    assert re.match(
+        r"Not stored: a result of this trial is recorded already: trial 0 has the distance",
+        second.message(),
+    )
+    assert second.page.locator("section.open").count() == 0
+
+    second.page.get_by_text("Other ways to choose a task").click()
+    second.page.get_by_label("goal [m], from 0.5 to 2").fill("1.25")
+    assert first.choose() == 1
+    second.trial(1).wait_for(timeout=WAIT)
+    assert second.page.get_by_label("goal [m], from 0.5 to 2").input_value() == "1.25"
+    assert [(trial.state, trial.executed) for trial in stored(first.folder)] == [("completed", True), ("open", False)]
+
+
+def fits_and_is_accessible(one: Operator) -> None:
+    """Check the dark page of a small screen, with everything unfolded."""
+    for summary in one.page.locator("summary").all():
+        summary.click()
+    assert accessibility_findings(one.page) == []
+    assert one.page.evaluate("document.documentElement.scrollWidth") <= 400
+    small = one.page.locator("button:visible, .files a:visible").evaluate_all(
+        "all => all.filter((one) => one.getBoundingClientRect().height < 40).map((one) => one.innerText)"
+    )
+    assert small == []
+    assert one.errors == []
 
 
 @pytest.mark.thorough
@@ -152,36 +209,6 @@ def test_a_wrong_file_is_refused_in_place_and_the_right_one_taken(browser: Any, 
     one.upload(number, record(files, folder / "run.csv"))
     assert one.message().startswith("Trial 0 has the distance")
     assert [re.findall(r"\d+", said) for said in one.errors] == [["422"]]
-
-
-def test_two_operators_lose_and_double_nothing(browser: Any, folder: Path, address: str) -> None:
-    first = Operator(browser, folder, address, accept_downloads=True)
-    second = Operator(browser, folder, address, accept_downloads=True)
-    number = first.opened()
-    recording = record(first.files(number), folder / "run.csv")
-    second.opened()
-    with second.page.expect_file_chooser() as chooser:
-        second.trial(number).get_by_label(f"Recording of trial {number}").click()
-    chooser.value.set_files(recording)
-    first.upload(number, recording)
-    told = second.trial(number).get_by_role("alert")
-    told.wait_for(timeout=WAIT)
-    assert told.inner_text() == "This trial has ended in the meantime: a result of it is recorded already."
-    with second.page.expect_navigation():
-        second.trial(number).get_by_role("button", name="Check and store the recording").click()
-    assert re.match(
-        r"Not stored: a result of this trial is recorded already: trial 0 has the distance",
-        second.message(),
-    )
-    assert second.page.locator("section.open").count() == 0
-
-    second.page.get_by_text("Other ways to choose a task").click()
-    second.page.get_by_label("goal [m], from 0.5 to 2").fill("1.25")
-    assert first.choose() == 1
-    second.trial(1).wait_for(timeout=WAIT)
-    assert second.page.get_by_label("goal [m], from 0.5 to 2").input_value() == "1.25"
-    assert [(trial.state, trial.executed) for trial in stored(folder)] == [("completed", True), ("open", False)]
-    assert first.errors == []
 
 
 @pytest.mark.thorough
@@ -284,23 +311,6 @@ def test_the_keyboard_reaches_everything_in_order(browser: Any, folder: Path, ad
     one.page.keyboard.type("the cable broke")
     one.page.keyboard.press("Enter")
     one.page.get_by_text("Trial 0 failed: the cable broke.").wait_for()
-
-
-def test_the_page_fits_a_small_screen_and_is_accessible(browser: Any, folder: Path, address: str) -> None:
-    ctxval("tell", "a.sqlite", "0", "--distance", "3", folder=folder)
-    ctxval("ask", "a.sqlite", "--explore", folder=folder)
-    one = Operator(browser, folder, address, viewport={"width": 400, "height": 800}, color_scheme="dark")
-    one.opened()
-    one.page.locator(".answer").get_by_text("falsified").wait_for(timeout=WAIT)
-    for summary in one.page.locator("summary").all():
-        summary.click()
-    assert accessibility_findings(one.page) == []  # those of the light page are looked for above
-    assert one.page.evaluate("document.documentElement.scrollWidth") <= 400
-    small = one.page.locator("button:visible, .files a:visible").evaluate_all(
-        "all => all.filter((one) => one.getBoundingClientRect().height < 40).map((one) => one.innerText)"
-    )
-    assert small == []
-    assert one.errors == []
 
 
 @pytest.mark.thorough

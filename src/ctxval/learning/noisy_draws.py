@@ -6,6 +6,7 @@ A draw has a residual and sequences of noise, and its distance is a quantile ove
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -109,7 +110,7 @@ class NoisyRuns:
     def step(self, x: Array, u: Array) -> Array:
         """Return the next records, shapes ``(..., n), (..., m) -> (..., n)``."""
         fit, memory = self._fit, self._memory
-        flat = u.reshape(-1, u.shape[-1])[:, : fit.scaled.inputs]  # those that act
+        flat = u.reshape(math.prod(u.shape[:-1]), u.shape[-1])[:, : fit.scaled.inputs]  # those that act
         with np.errstate(all="ignore"):
             z = (fit.history.regressors(memory, flat) - fit.scaled.shift) / fit.scaled.scale
             z = np.clip(np.nan_to_num(z, nan=0.0, posinf=1e3, neginf=-1e3), -1e3, 1e3)

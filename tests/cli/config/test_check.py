@@ -17,7 +17,7 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     *more(("pendulum", {"variant": "biased"}), ("dubins", {"variant": "basin"}), ("dubins", {"variant": "heavy-tail"})),
     *more(("arm", {"model": "gp"}), ("arm", {"model": "fnn"})),
     ("linear", {"dim": 1}),
-    ("linear", {"dim": 10}),
+    *more(("linear", {"dim": 10})),
 ]
 
 
@@ -43,7 +43,7 @@ def test_a_task_of_a_batch_may_differ_by_rounding_alone(error: float, state: str
 
     def task(p: Parameters) -> Task:
         goal = np.asarray(p.goal) * (1 + error * np.ndim(p.goal))
-        return Task([np.pi, 0.0], goal=np.stack([goal, 0 * goal], axis=-1), horizon=25, dt=0.02)
+        return Task([np.pi, 0.0], goal=np.stack([goal, 0 * goal], axis=-1), horizon=5, dt=0.02)
 
     validation.task = task
     found = check_experiment(Experiment("x", validation))
@@ -52,7 +52,7 @@ def test_a_task_of_a_batch_may_differ_by_rounding_alone(error: float, state: str
 
 @pytest.mark.parametrize(("unit", "expected"), [((), True), (("m",), False)])
 def test_it_says_what_a_unit_of_length_is_good_for(unit: tuple[str, ...], expected: bool) -> None:
-    validation = make_validation()
+    validation = make_validation(horizon=5)
     validation.space = TaskSpace(goal=(-3.0, 3.0, *unit), side=(0.0, 1.0, *unit))
     (finding,) = [each for each in check_experiment(Experiment("x", validation)) if each.check == "space"]
     assert (finding.state == "noted") == ("places of positions are tested" in finding.text) == expected
