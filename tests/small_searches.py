@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ctxval.certificates import Maxima, Sample, draw_maxima
+from ctxval.certificates import Forecast, Maxima, Sample, draw_maxima, forecast
 from ctxval.learning.dynamics_posterior import PosteriorSettings
 from ctxval.learning.hyperparameters import FAMILIES
 from ctxval.learning.worst_case import WorstCaseSettings
@@ -13,11 +13,15 @@ from ctxval.searches.trust_region import FAST
 
 
 def take_few_draws(replace: Callable[[str, Any], None]) -> None:
-    """Make the draws of d* fewer, by a function that replaces an attribute."""
+    """Make the draws of d* and the futures of forecasts fewer, by a function that replaces an attribute."""
 
     def fewer(sample: Sample, *, draws: int = 12, paths: int = 4, **options: Any) -> Maxima:
         return draw_maxima(sample, draws=min(draws, 12), paths=4, **options)
 
+    def shorter(sample: Sample, maxima: Maxima, threshold: float, confidence: float) -> Forecast:
+        return forecast(sample, maxima, threshold, confidence, futures=6)
+
+    replace("ctxval.certificates.posterior.forecast", shorter)
     for module in ("stopping", "posterior", "maxima"):
         replace(f"ctxval.certificates.{module}.draw_maxima", fewer)
     replace("ctxval.certificates.maxima._MOST", 1)  # the draws are not doubled where a bound is near the threshold

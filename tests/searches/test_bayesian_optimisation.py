@@ -166,7 +166,6 @@ def test_what_failed_is_not_asked_again_and_does_not_stop_the_search() -> None:
 
 @pytest.mark.slow
 def test_it_keeps_the_contract_of_a_search() -> None:
-    check_search(BayesianOptimisation())
     check_search(BayesianOptimisation(initial=1), dimension=5, budget=12)
     assert type(by_name("bayesian-optimisation", beta=1.0)) is BayesianOptimisation
 
