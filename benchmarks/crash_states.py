@@ -184,20 +184,23 @@ def _examined(given: tuple[Recording, State, bool]) -> Counter[str]:
     return examine(recording, state, resume=resume)
 
 
-def count(recording: Recording, mode: Mode, each: int, seed: int, resume_each: int, workers: int) -> Counter[str]:
-    """Examine the states of a recording that differ; each so many-th is resumed."""
+def count(
+    recording: Recording, mode: Mode, each: int, seed: int, resume_each: int, workers: int, every: int = 1
+) -> Counter[str]:
+    """Examine the states of a recording that differ, or every so many-th of them; each so many-th is resumed."""
     unlike: dict[str, State] = {}
     total = 0
     for state in states(recording, mode, each, seed):
         total += 1
         unlike.setdefault(state.key, state)
-    jobs = [(recording, state, place % resume_each == 0) for place, state in enumerate(unlike.values())]
+    chosen = [*unlike.values()][::every]
+    jobs = [(recording, state, place % resume_each == 0) for place, state in enumerate(chosen)]
     counts: Counter[str] = Counter(dict.fromkeys(COUNTS, 0))
     with ProcessPoolExecutor(workers) if workers > 1 else contextlib.nullcontext() as pool:
         examined = map(_examined, jobs) if pool is None else pool.map(_examined, jobs, chunksize=64)
         for found in examined:
             counts.update(found)
-    counts["distinct"], counts["states"] = len(unlike), total
+    counts["distinct"], counts["states"] = len(chosen), total
     return counts
 
 

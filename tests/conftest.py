@@ -240,8 +240,8 @@ def one_in_full(request: pytest.FixtureRequest, smaller: pytest.MonkeyPatch, mod
 
 @pytest.fixture
 def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take few draws of d*, where tests compute in full otherwise."""
-    take_few_draws(monkeypatch.setattr)
+    """Take few draws of d*, where tests compute in full otherwise, and those of the same trials once."""
+    take_few_draws(monkeypatch.setattr, once=True)
 
 
 @pytest.fixture

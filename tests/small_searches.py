@@ -5,21 +5,37 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ctxval.certificates import Maxima, Sample, draw_maxima
+from ctxval.certificates import Forecast, Maxima, Sample, draw_maxima, forecast
 from ctxval.learning.dynamics_posterior import PosteriorSettings
 from ctxval.learning.hyperparameters import FAMILIES
 from ctxval.learning.worst_case import WorstCaseSettings
 from ctxval.searches.trust_region import FAST
 
+drawn: dict[tuple[Any, ...], Maxima] = {}
 
-def take_few_draws(replace: Callable[[str, Any], None]) -> None:
-    """Make the draws of d* fewer, by a function that replaces an attribute."""
+
+def take_few_draws(replace: Callable[[str, Any], None], *, once: bool = False) -> None:
+    """Make the draws of d* and the futures of forecasts fewer, by a function that replaces an attribute.
+
+    With ``once``, the draws of the same trials are remembered for later tests of the process.
+    """
 
     def fewer(sample: Sample, *, draws: int = 12, paths: int = 4, **options: Any) -> Maxima:
         return draw_maxima(sample, draws=min(draws, 12), paths=4, **options)
 
+    def remembered(sample: Sample, *, draws: int = 12, **options: Any) -> Maxima:
+        trials = (sample.points.shape, sample.points.tobytes(), sample.distances.tobytes(), *sample.states)
+        key = (*trials, min(draws, 12), repr(sorted(options.items())))
+        if key not in drawn:
+            drawn[key] = fewer(sample, draws=draws, **options)
+        return drawn[key]
+
+    def shorter(sample: Sample, maxima: Maxima, threshold: float, confidence: float) -> Forecast:
+        return forecast(sample, maxima, threshold, confidence, futures=6)
+
+    replace("ctxval.certificates.posterior.forecast", shorter)
     for module in ("stopping", "posterior", "maxima"):
-        replace(f"ctxval.certificates.{module}.draw_maxima", fewer)
+        replace(f"ctxval.certificates.{module}.draw_maxima", remembered if once else fewer)
     replace("ctxval.certificates.maxima._MOST", 1)  # the draws are not doubled where a bound is near the threshold
 
 

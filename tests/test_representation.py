@@ -96,7 +96,7 @@ def no_execution(controller: Any, task: Task) -> Any:
 
 @functools.cache
 def campaign() -> Campaign:
-    return Campaign(make_validation(), seed=1, name="pendulum").run(7, explore=True)
+    return Campaign(make_validation(horizon=10), seed=1, name="pendulum").run(7, explore=True)
 
 
 @functools.cache
@@ -179,7 +179,7 @@ def learned() -> learning.LearnedDynamics:
     """Return what one execution teaches of a system that M does not explain."""
     found = Validation(
         space=TaskSpace(start=([-2.0, -1.0], [2.0, 1.0])),
-        task=lambda p: Task(p.start, goal=[0.3, 0.0], horizon=20, dt=0.1),
+        task=lambda p: Task(p.start, goal=[0.3, 0.0], horizon=10, dt=0.1),
         system=systems.Simulated(nonlinear, vectorized=True),
         model=models.Linear(LINEAR.A, LINEAR.B),
         synthesizer=controllers.LQR([1, 0.1], [0.1]),

@@ -17,6 +17,7 @@ from crash.disk import SECTOR, Disk, Mode  # noqa: E402
 from crash.recorder import Event  # noqa: E402
 from crash_states import count, recorded  # noqa: E402
 from ctxval.campaign.storage import disks  # noqa: E402
+from rig_thorough import more  # noqa: E402
 
 needs_strace = pytest.mark.skipif(shutil.which("strace") is None, reason="writes are recorded with strace")
 
@@ -83,11 +84,11 @@ def test_a_renamed_file_has_one_of_its_names() -> None:
 @pytest.mark.slow
 @needs_strace
 @pytest.mark.parametrize(
-    ("name", "mode"), [("hand", "ordered"), pytest.param("full", "strict", marks=pytest.mark.thorough)]
+    ("name", "mode", "every"), [("hand", "ordered", 2), *more(("hand", "ordered", 1), ("full", "strict", 1))]
 )
-def test_no_acknowledged_execution_is_lost_or_doubled(name: str, mode: Mode, tmp_path: Path) -> None:
-    counts = count(recorded(name, tmp_path), mode, each=1, seed=0, resume_each=100, workers=1)
-    assert counts["distinct"] > 200
+def test_no_acknowledged_execution_is_lost_or_doubled(name: str, mode: Mode, every: int, tmp_path: Path) -> None:
+    counts = count(recorded(name, tmp_path), mode, each=1, seed=0, resume_each=100 // every, workers=1, every=every)
+    assert counts["distinct"] > 200 / every
     assert counts["resumed"] > 1
     assert counts["opened"] == counts["distinct"]
     assert counts["went on"] == counts["resumed"]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from ctxval import grid_truth
+from ctxval import Task, grid_truth
 from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
 from rig_thorough import some
@@ -178,7 +178,8 @@ def test_noise_belongs_to_the_task_and_averages_are_over_realisations() -> None:
     points = found.space.iid(30, np.random.default_rng(0))
     np.testing.assert_array_equal(found.distances(points), found.distances(points))
     plan = found.plan(points[0])
-    quiet = Noisy(found.system.step, (0.0, 0.0), 0).execute(plan.controller, plan.task)
-    gaps = [one.execute(plan).states[1] - quiet.states[1] for one in realisations(found, 400)]
+    begun = Task(plan.task.initial_state, goal=plan.task.goal, horizon=4, dt=plan.task.dt)
+    quiet = Noisy(found.system.step, (0.0, 0.0), 0).execute(plan.controller, begun)
+    gaps = [one.system.execute(plan.controller, begun).states[1] - quiet.states[1] for one in realisations(found, 400)]
     np.testing.assert_allclose(np.std(gaps, axis=0), found.system.deviation, rtol=0.15)
     assert len(realisations(ENTRIES["two-tanks"](0).validation, 5)) == 1

@@ -80,7 +80,7 @@ def test_batches_agree_with_single_executions(name: str) -> None:
     np.testing.assert_allclose(validation.distances(points), alone, rtol=1e-6, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", EACH)
 def test_the_systems_conform_and_the_model_carries_its_data(name: str) -> None:
     found = experiment(name, 0)
     assert found.name == name

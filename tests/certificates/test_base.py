@@ -102,7 +102,6 @@ def test_more_confidence_never_gives_a_lower_bound_or_a_smaller_volume(kind: str
     assert low.volume <= high.volume
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_has_its_name_on_its_certificate(kind: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,11 @@ def envelope(evidence: DynamicsEvidence | None = None, **changes: Any) -> Envelo
     return envelope_of(SPACE, drawn, evidence or evidence_of(), EXECUTED, 0.6, 0.95)
 
 
+@functools.cache
+def usual_envelope() -> Envelope:
+    return envelope()
+
+
 def test_the_factor_holds_for_all_tasks_of_a_further_draw() -> None:
     held = 0
     for seed in range(300):
@@ -68,7 +74,7 @@ def test_a_confidence_that_needs_more_draws_is_refused() -> None:
 
 
 def test_tasks_below_the_threshold_are_trusted_in_their_own_units() -> None:
-    found = envelope()
+    found = usual_envelope()
     assert found.doubt is None
     loads = np.array([0.2, 1.5, 2.0, 2.8, 3.9])
     tasks = np.stack([np.linspace(-1.5, 1.5, 5), loads], axis=1)
@@ -89,7 +95,7 @@ def test_an_executed_excess_is_never_trusted() -> None:
     executed = [*EXECUTED, (point, 0.601)]
     found = envelope_of(SPACE, drawn_from(POINTS), evidence_of(), executed, 0.6, 0.95)
     assert not found.trusted(SPACE.from_unit(point))
-    assert envelope().trusted(SPACE.from_unit(point))
+    assert usual_envelope().trusted(SPACE.from_unit(point))
 
 
 def test_tasks_that_leave_the_records_or_cannot_be_planned_are_not_trusted() -> None:
@@ -103,11 +109,11 @@ def test_tasks_that_leave_the_records_or_cannot_be_planned_are_not_trusted() -> 
     assert (low[trusted, 0] > 0.2).all()
     assert 0.25 < found.uncovered < 0.33
     assert "of the tasks are predicted to stay below it, but their runs leave what was recorded" in found.statement
-    assert envelope().uncovered == 0
+    assert usual_envelope().uncovered == 0
 
 
 def test_a_test_that_exceeds_its_prediction_raises_the_factor() -> None:
-    usual, evidence = envelope(), evidence_of()
+    usual, evidence = usual_envelope(), evidence_of()
     worse = replace(evidence.predictions[3], distance=0.48)
     predictions = (*evidence.predictions[:3], worse, *evidence.predictions[4:])
     raised = envelope(replace(evidence, predictions=predictions))
@@ -133,7 +139,7 @@ def test_distances_that_the_draws_do_not_have_raise_the_factor(sign: int) -> Non
     raised = envelope_of(SPACE, drawn, missed, EXECUTED, 0.6, 0.95)
     assert raised.factor == pytest.approx(7)
     assert raised.raised_by == 11
-    assert raised.share < envelope().share
+    assert raised.share < usual_envelope().share
     above = replace(test, point=tuple(POINTS[int(drawn.mean.argmax())]))  # nothing is claimed of this task
     known = envelope_of(SPACE, drawn, replace(evidence, predictions=(above,)), EXECUTED, 0.6, 0.95)
     assert known.raised_by is None
@@ -194,7 +200,7 @@ def test_the_onnx_file_computes_the_same(tmp_path: Path) -> None:
     pytest.importorskip("onnx")
     onnxruntime = pytest.importorskip("onnxruntime")
     rng = np.random.default_rng(4)
-    for known in (envelope(beyond=np.where(POINTS[:, 0] > 0.9, 0.1, 0.0)), envelope()):
+    for known in (envelope(beyond=np.where(POINTS[:, 0] > 0.9, 0.1, 0.0)), usual_envelope()):
         path = known.save(tmp_path / "folder" / "envelope.onnx")
         session = onnxruntime.InferenceSession(str(path))
         tasks = np.concatenate([SPACE.from_unit(rng.uniform(-0.1, 1.1, (500, 2))), SPACE.from_unit(np.eye(2))])
@@ -272,4 +278,4 @@ def test_tasks_whose_runs_come_to_contacts_are_not_trusted() -> None:
     assert IRREGULAR in found.assumptions
     assert "leave what was recorded or come to contacts" in found.statement
     assert "7 recorded steps are no smooth function of what is recorded, as contacts are" in found.statement
-    assert "come to contacts" not in envelope().statement
+    assert "come to contacts" not in usual_envelope().statement

@@ -35,6 +35,12 @@ def quick(trials: Sample, seed: int = 0, stochastic: bool = False) -> Maxima:
     return draw_maxima(trials, draws=10, paths=4, seed=seed, stochastic=stochastic)
 
 
+@pytest.fixture(scope="module")
+def usual() -> Maxima:
+    """The draws of a sample with the first seed."""
+    return quick(sample())
+
+
 # The order statistic
 
 
@@ -87,9 +93,8 @@ def test_no_bound_is_below_the_largest_distance_that_was_executed(d: int) -> Non
     assert Posterior().certify_drawn(trials, maxima, 0.01).upper_bound >= trials.best
 
 
-def test_units_do_not_matter() -> None:
-    plain, scaled = quick(sample()), quick(sample(factor=4.0))
-    np.testing.assert_allclose(scaled.draws, 4 * plain.draws, rtol=1e-6)
+def test_units_do_not_matter(usual: Maxima) -> None:
+    np.testing.assert_allclose(quick(sample(factor=4.0)).draws, 4 * usual.draws, rtol=1e-6)
     own = Prior(offset=None)  # the logarithm's zero is that of the distance
     trials = sample()
     moved = Sample(trials.points, trials.distances + 50, trials.origins, trials.states)
@@ -97,9 +102,9 @@ def test_units_do_not_matter() -> None:
     np.testing.assert_allclose(second.draws - 50, first.draws, atol=1e-3)
 
 
-def test_the_seed_decides_and_the_order_of_origins_does_not() -> None:
-    np.testing.assert_array_equal(quick(sample()).draws, quick(sample(origin="iid")).draws)
-    assert (quick(sample(), seed=1).draws != quick(sample(), seed=2).draws).any()
+def test_the_seed_decides_and_the_order_of_origins_does_not(usual: Maxima) -> None:
+    np.testing.assert_array_equal(usual.draws, quick(sample(origin="iid")).draws)
+    assert (quick(sample(), seed=1).draws != usual.draws).any()
 
 
 def test_a_function_that_is_known_densely_leaves_no_gap() -> None:
@@ -239,8 +244,8 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return seeds
 
 
-def test_far_from_the_threshold_the_draws_are_those_of_one_seed(monkeypatch: pytest.MonkeyPatch) -> None:
-    seeds, usual = counted(monkeypatch), quick(sample())
+def test_far_from_the_threshold_the_draws_are_those_of_one_seed(usual: Maxima, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds = counted(monkeypatch)
     for threshold in (1e-3, 1e3):
         np.testing.assert_array_equal(settle_maxima(sample(), threshold, 0.9).draws, usual.draws)
     assert seeds == [0, 0]

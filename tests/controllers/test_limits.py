@@ -15,6 +15,7 @@ from ctxval.controllers import ILQR, LQR, Limits
 from ctxval.core.rollout import rollout
 from ctxval.errors import InputError
 from ctxval.models import Function, Linear
+from rig_thorough import more
 
 Q, R, Q_FINAL = [10.0, 1.0], [0.1], [50.0, 5.0]
 
@@ -72,7 +73,7 @@ def cost(inputs: Array, task: Task) -> float:
     return 0.5 * float(running + gaps[-1] ** 2 @ Q_FINAL)
 
 
-@pytest.mark.parametrize("start", [0.4, 0.8, -0.6])
+@pytest.mark.parametrize("start", [0.8, *more(0.4, -0.6)])
 def test_ilqr_on_a_nonlinear_model_is_no_worse_than_a_bounded_optimiser(start: float) -> None:
     task = Task([start, 0.0], goal=[0.0, 0.0], horizon=20, dt=0.05)
     solution = ILQR(Q, R, Q_FINAL, limits=4.5).solve(task, PENDULUM)

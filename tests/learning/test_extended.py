@@ -162,6 +162,7 @@ def random_executions(validation: Validation, count: int) -> list[tuple[Array, A
     return [(unit, validation.execute(validation.plan(validation.space.from_unit(unit)))) for unit in points]
 
 
+@pytest.mark.usefixtures("few_loops")
 def test_nothing_is_suspected_if_state_and_input_explain_the_executions() -> None:
     validation = loaded_cart().with_parts(
         system=systems.Simulated(lambda x, u: cart(x, u, np.array(0.3)), vectorized=True)
@@ -194,6 +195,7 @@ def test_a_parameter_that_clearly_explains_the_executions_is_found() -> None:
     assert prediction.score(trajectory, 0.2) is not None  # it is one of the states of the system
 
 
+@pytest.mark.usefixtures("few_loops")
 @pytest.mark.parametrize("load", [0.0, 0.5])
 def test_data_of_another_system_are_left_out(load: float) -> None:
     """M was learned without a load. If the system carries one, the data of M contradict its executions."""

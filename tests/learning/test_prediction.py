@@ -202,6 +202,7 @@ class OneByOne:
         return self.inner.design(task, model)
 
 
+@pytest.mark.usefixtures("few_loops")
 def test_the_vectors_need_no_design_of_a_task_that_is_planned() -> None:
     validation = linear.experiment(0, dim=2).validation
     validation.synthesizer = synthesizer = OneByOne(validation.synthesizer)
@@ -217,6 +218,7 @@ def test_the_vectors_need_no_design_of_a_task_that_is_planned() -> None:
     assert synthesizer.designed == designed
 
 
+@pytest.mark.usefixtures("few_loops")
 @pytest.mark.parametrize("part", ["model", "synthesizer"])
 def test_parts_that_are_changed_in_place_are_seen(part: str) -> None:
     validation = linear.experiment(0, dim=2).validation

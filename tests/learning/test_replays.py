@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from conftest import make_validation
 from ctxval import Task, Validation, controllers, models
@@ -37,6 +38,7 @@ def test_a_replay_predicts_the_execution_that_it_was_not_learned_from() -> None:
         assert (np.abs(replay.corrected.states - trajectory.states) < 0.05 * spans).all()
 
 
+@pytest.mark.usefixtures("few_loops")
 def test_its_own_execution_does_not_matter() -> None:
     validation = make_validation()
     known = executed(validation, np.linspace(0.1, 0.9, 5))

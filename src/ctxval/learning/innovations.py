@@ -363,7 +363,7 @@ def _sensitivities(
             def step(x: Array) -> Array:
                 rest = np.broadcast_to(z[:, n:], (*x.shape[:-1], z.shape[1] - n))
                 moved = np.concatenate([x, rest], axis=-1).reshape(-1, z.shape[1])
-                inputs = np.broadcast_to(u, (*x.shape[:-1], u.shape[1])).reshape(-1, u.shape[1])
+                inputs = np.broadcast_to(u, (*x.shape[:-1], u.shape[1])).reshape(len(moved), u.shape[1])
                 after = history.model.step(moved[:, :n], inputs) + residual(moved)
                 return np.asarray(after.reshape(x.shape))
 

@@ -29,7 +29,7 @@ def experiment(request: pytest.FixtureRequest) -> Experiment:
 
 @pytest.fixture(scope="module")
 def aspects() -> dict[str, arm.Aspects]:
-    return {model: arm.aspects(1, model, SMALL, per_axis=7) for model in arm.MODELS}
+    return {model: arm.aspects(1, model, SMALL, per_axis=5) for model in arm.MODELS}
 
 
 def fingertip(angles: Array) -> Array:
@@ -98,13 +98,13 @@ def test_every_target_is_within_reach_and_clear_of_the_stops() -> None:
 
 
 @pytest.mark.slow
-def test_the_recordings_hardly_meet_the_stops() -> None:
+@pytest.mark.parametrize("seed", [0, *more(1, 2, 3, 4)])
+def test_the_recordings_hardly_meet_the_stops(seed: int) -> None:
     settings = arm.Settings()
-    for seed in range(5):
-        data = arm.record(arm.arm(settings), settings, seed)
-        assert len(data) == 2000
-        assert np.mean(np.abs(data.x_next[:, 1]) > 3.0) < 0.01
-        assert np.abs(data.u).max() <= settings.torque
+    data = arm.record(arm.arm(settings), settings, seed)
+    assert len(data) == 2000
+    assert np.mean(np.abs(data.x_next[:, 1]) > 3.0) < 0.01
+    assert np.abs(data.u).max() <= settings.torque
 
 
 def test_all_models_of_a_seed_learn_from_the_same_data() -> None:
