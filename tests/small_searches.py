@@ -36,6 +36,7 @@ def take_few_draws(replace: Callable[[str, Any], None], *, once: bool = False) -
     replace("ctxval.certificates.posterior.forecast", shorter)
     for module in ("stopping", "posterior", "maxima"):
         replace(f"ctxval.certificates.{module}.draw_maxima", remembered if once else fewer)
+    replace("ctxval.gp.hyperposterior.WAVES", 64)
     replace("ctxval.certificates.maxima._MOST", 1)  # the draws are not doubled where a bound is near the threshold
 
 

@@ -100,7 +100,8 @@ def test_the_command_of_a_report_names_the_experiment_file(invoke: Any) -> None:
 
 
 def test_run_writes_a_report_next_to_the_store(invoke: Any) -> None:
-    done = invoke("run", "short_rig:experiment", "--search", "gp-ucb", "--resolution", "1", "--tests", "0", "--json")
+    options = ("--search", "gp-ucb", "--threshold", "200", "--resolution", "1", "--tests", "0")
+    done = invoke("run", "short_rig:experiment", *options, "--json")
     report = json.loads(done.stdout)
     assert report["report"] == "runs/short-gp-ucb-seed0.report.html"
     page = Path(report["report"]).read_text(encoding="utf-8")
