@@ -468,10 +468,9 @@ def test_an_audit_that_is_extended_counts_what_was_decided_on_last(invoke, campa
 
 
 @pytest.mark.slow
-@pytest.mark.in_full
 def test_draws_that_ended_with_the_verdict_have_no_number_chosen_beforehand(invoke) -> None:  # type: ignore[no-untyped-def]
     arguments = ("run", "rig:experiment", "--search", "random", "--store", "a.sqlite")
-    invoke(*arguments, "--threshold", "90", "--resolution", "1", "--tests", "0", "--decide", "--budget", "12")
+    invoke(*arguments, "--threshold", "90", "--resolution", "1", "--tests", "0", "--decide", "--budget", "4")
     for kind, sentence in (("scenario", "the draws ended with the verdict"), ("audit", "none counts")):
         result = invoke("certify", "a.sqlite", "--kind", kind)
         assert result.exit_code == 2
