@@ -28,6 +28,8 @@ LONG = (
     "plot_6_aspect1",
     "plot_6_comparison",
     "plot_6_refine",
+    "plot_7_replay",
+    "plot_8_fit",
 )
 """Scripts that only `make docs` and `make thorough` run."""
 NEEDS = {"plot_2_arm": "mujoco", "plot_7_replay": "mcap", "plot_8_fit": "onnx"}

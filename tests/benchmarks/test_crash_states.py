@@ -84,7 +84,7 @@ def test_a_renamed_file_has_one_of_its_names() -> None:
 @pytest.mark.slow
 @needs_strace
 @pytest.mark.parametrize(
-    ("name", "mode", "every"), [("hand", "ordered", 2), *more(("hand", "ordered", 1), ("full", "strict", 1))]
+    ("name", "mode", "every"), [("hand", "ordered", 4), *more(("hand", "ordered", 1), ("full", "strict", 1))]
 )
 def test_no_acknowledged_execution_is_lost_or_doubled(name: str, mode: Mode, every: int, tmp_path: Path) -> None:
     counts = count(recorded(name, tmp_path), mode, each=1, seed=0, resume_each=100 // every, workers=1, every=every)

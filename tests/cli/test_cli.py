@@ -668,7 +668,7 @@ def test_every_help_text_is_a_sentence() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("reader", "status"), [("ended", 141), ("full disk", 2)])
+@pytest.mark.parametrize(("reader", "status"), [*more(("ended", 141)), ("full disk", 2)])
 def test_an_error_that_cannot_be_written_as_json_keeps_its_exit_status(
     tmp_path: Path, reader: str, status: int
 ) -> None:

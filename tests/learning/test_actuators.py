@@ -164,6 +164,7 @@ def test_a_distance_of_inputs_sees_what_is_commanded() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("few_loops")
 def test_other_task_parameters_and_late_inputs_are_found_together() -> None:
     @dataclass(frozen=True)
