@@ -70,7 +70,9 @@ def test_workers_and_a_resumed_campaign_have_the_same_distances(tmp_path: Path) 
     assert first.executions == 4
     resumed = Campaign(made, seed=3, store=tmp_path / "cart.sqlite")
     assert resumed.executions == 4
-    verdict = resumed.run(25, 3 * largest, workers=2, certificate=UNTESTED).verdict(3 * largest, certificate=UNTESTED)
+    verdict = resumed.run(25, 1.5 * largest, workers=2, certificate=UNTESTED).verdict(
+        1.5 * largest, certificate=UNTESTED
+    )
     assert verdict.answer == "validated", verdict.reason
     points = np.array([trial.parameters["goal"] for trial in resumed.completed])[:, None]
     distances_ = [trial.distance for trial in resumed.completed]

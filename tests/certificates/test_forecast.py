@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ctxval.certificates import Forecast, Maxima, Sample, draw_maxima, forecast
+from rig_thorough import more
 
 CONFIDENCE = 0.9
 
@@ -44,11 +45,13 @@ def test_a_threshold_closer_to_the_largest_distance_takes_more_executions_to_kee
 
 
 @pytest.mark.slow
-def test_what_the_bound_leaves_undecided_takes_at_least_one_execution(sample: Sample, found: Maxima) -> None:
-    for share in (0.3, 0.99):
-        tau = sample.best + share * (found.upper(CONFIDENCE) - sample.best)
-        expected = forecast(sample, found, tau, CONFIDENCE, futures=4)
-        assert expected.executions is None or expected.executions >= 1
+@pytest.mark.parametrize("share", [0.3, 0.99, *more(0.6, 0.9)])
+def test_what_the_bound_leaves_undecided_takes_at_least_one_execution(
+    share: float, sample: Sample, found: Maxima
+) -> None:
+    tau = sample.best + share * (found.upper(CONFIDENCE) - sample.best)
+    expected = forecast(sample, found, tau, CONFIDENCE, futures=4)
+    assert expected.executions is None or expected.executions >= 1
 
 
 def test_a_forecast_is_the_same_twice(sample: Sample, found: Maxima) -> None:

@@ -244,7 +244,7 @@ def position_states(
     return groups
 
 
-# Corners
+# Parameters and corners
 
 
 def farthest_value(

@@ -236,6 +236,8 @@ class LearnedDynamics(ShortRepr):
         What such a parameter changes in the system is met by no choice that follows predictions. Trying it costs no
         execution of its own. The task stays the same if another distance is predicted for the moved one.
         """
+        if not self.study.unseen_parameters:
+            return task
         rng, moved = np.random.default_rng([self.study.seed, len(known)]), task.copy()
         for j in self.study.unseen_parameters:
             moved[j] = farthest_value(known[:, j], rng=rng)[1]
