@@ -23,8 +23,9 @@ from strangers_diagnostics import JudgedRun
 from strangers_reporting import REPORTING
 from strangers_truths import SEEDS, TRUTHS
 
-RULE = 10
-"""Version of the rule by which campaigns are run: 10 spreads the values of parameters that change no prediction, so
+RULE = 11
+"""Version of the rule by which campaigns are run: 11 tests twice as often if M ignores a task parameter, of which
+tasks are no new ones by its value alone; 10 spreads the values of parameters that change no prediction, so
 that only campaigns of systems with such parameters differ from 9, and the others have its number; 9 looks beside a
 failed test only if what is learned does not explain it by now, so that only campaigns with drawn tests differ from 8,
 and the others have its number; 8 enters places of positions after the tests, so that only campaigns of systems with

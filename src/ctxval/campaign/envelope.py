@@ -158,11 +158,13 @@ class EnvelopeSearch:
         It is None if executions may differ by noise: then others may be needed to falsify the model.
         """
         interval, trials, recorder = self._interval, self._ended(), self._recorder
-        missing = interval.tests - _stored_tests(recorder, trials)
-        if not 0 < self._left <= missing or interval.best <= self._threshold or not interval.predicts:
+        if interval.best <= self._threshold or not interval.predicts or not recorder.has_tasks:
             return None
-        known = self._known(trials) if recorder.has_tasks else None
-        return None if known is None or self._regular(trials, known[1]) is None else interval.test()
+        known = self._known(trials)
+        missing = 0 if known is None else known[1].tests - _stored_tests(recorder, trials)
+        if known is None or not 0 < self._left <= missing:
+            return None
+        return None if self._regular(trials, known[1]) is None else interval.test()
 
     def choose(self) -> Choice | None:
         """Return the next task that enlarges the envelope, or a test of it; None if it would hardly grow.
@@ -182,7 +184,7 @@ class EnvelopeSearch:
         explained = all(is_explained(each, self._threshold) for each in known[1].predictions)
         regular = None if known[1].quantile is None and explained else self._regular(trials, known[1])
         learned, evidence = regular or known
-        missing = missing_tests(evidence.predictions, interval.tests)
+        missing = missing_tests(evidence.predictions, evidence.tests)
         if missing and self._left <= missing:
             return interval.test()
         if evidence.untried is not None and untried_parameter(evidence) is not None:
@@ -224,7 +226,7 @@ class EnvelopeSearch:
         if learned is None or evidence is None:
             return None
         noise, without = learned.drawn_from.noise, learned.posterior.covariances.without_model
-        return learned, replace(evidence, noise=noise, without_model=without, tests=self._interval.tests)
+        return learned, replace(evidence.needing(self._interval.tests), noise=noise, without_model=without)
 
     def _drawn(self, learned: LearnedDynamics, evidence: DynamicsEvidence) -> DrawnDistances:
         """Return the drawn distances of the pool's tasks, of executed ones and of tasks next to the boundary."""

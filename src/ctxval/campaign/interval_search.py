@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Rows
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.history import largest_distance, waiting_points
@@ -157,7 +157,7 @@ class IntervalSearch:
             whole = dynamics.evidence(trials, self.options.confidence, keep=self.keeps)
             if whole is None:
                 return self._by_distance()
-            evidence = replace(whole, tests=self.tests)
+            evidence = whole.needing(self.tests)
             with suppress(CertificateError):
                 if certify_dynamics(Sample.of(self._ended), evidence, self.options.confidence).covers(self.limit):
                     return None
@@ -255,8 +255,12 @@ class IntervalSearch:
         # Failed ones count twice: without a reason, they are not repeated, although a start may jump next to them.
         failed = [trial for trial in trials if trial.state == "failed"]
         known, waiting = self._points([*self._ended, *failed]), waiting_points(trials)
-        point = next_task(evidence, known, best, limit, confidence, steady, self._near)
-        if len(waiting) and (point is None or np.abs(waiting - point).max(axis=1).min() <= NEAR):
+        # Tasks that differ in parameters that change no prediction are one task, with values that are spread.
+        spread, seen = None, self.recorder.dynamics.study.seen_parameters
+        if learned is not None and self._suite is None:
+            spread = learned.spread_unseen
+        point = next_task(evidence, known, best, limit, confidence, steady, self._near, spread, seen)
+        if len(waiting) and (point is None or np.abs(waiting - point)[:, seen].max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.
             if learned is not None:
                 expected = learned.expected(waiting)
@@ -264,9 +268,7 @@ class IntervalSearch:
                 limit = (1 + self.within) * best if self.threshold is None else limit
             after = self.recorder.dynamics.screening(trials, pending=True) or evidence
             known = self._points([*trials, *failed])
-            point = next_task(after, known, best, limit, confidence, steady, self._near)
-        if learned is not None and point is not None and self._suite is None:
-            point = learned.spread_unseen(point, known)
+            point = next_task(after, known, best, limit, confidence, steady, self._near, spread, seen)
         return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
     # What is known
@@ -277,7 +279,7 @@ class IntervalSearch:
         if not self.predicts:
             return None
         evidence = dynamics.kept_evidence(trials, self.options.confidence) or dynamics.screening(trials)
-        return None if evidence is None else replace(evidence, tests=self.tests)
+        return None if evidence is None else evidence.needing(self.tests)
 
     def _lacks_tests_alone(self, evidence: DynamicsEvidence) -> bool:
         """Return whether nothing but tests is missing for a validation, as far as a few posterior samples say."""
@@ -361,6 +363,8 @@ def next_task(
     confidence: float,
     steady: Callable[[Array], bool] = lambda point: True,
     near: float = NEAR,
+    spread: Callable[[Array, Array], Array] | None = None,
+    seen: Rows | None = None,
 ) -> Array | None:
     """Return the task to execute next, a point ``(d,)``; None if all tasks lie next to executed ones.
 
@@ -371,7 +375,8 @@ def next_task(
 
     The known tasks ``(n, d)`` are executed or open, ``best`` is the largest executed distance, and ``limit`` is what
     the bound must not exceed. A task may be executed only if it is steady: its distance is that of its neighbours. It
-    is new if one of its coordinates differs by more than ``near`` from those of each known one.
+    is new if one of its coordinates differs by more than ``near`` from those of each known one. If ``spread`` moves a
+    task, given the known ones, the moved task is executed, and it must be new in the ``seen`` coordinates.
     """
     order = np.argsort(evidence.maxima, kind="stable")
     rank = evidence.rank(confidence)
@@ -397,14 +402,20 @@ def next_task(
     else:
         candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]
 
-    def is_new(point: Array) -> bool:
-        close = known[np.abs(known - point).max(axis=1) <= near]
+    def is_new(point: Array, by: Rows) -> bool:
+        others, task = known[:, by], point[by]
+        close = others[np.abs(others - task).max(axis=1) <= near]
         # A start may jump between tasks, so the closed loop next to an executed task may lead elsewhere.
         most = 2 if np.array_equal(point, evidence.coverage.task) else 1
-        return len(close) < most and not (close == point).all(axis=1).any()
+        return len(close) < most and not (close == task).all(axis=1).any()
 
     # Of random tasks, the one farthest from all known tasks comes first.
-    spread = np.random.default_rng(len(known)).random((256, known.shape[1]))
-    away = np.abs(spread[:, None] - known).max(axis=2).min(axis=1, initial=1.0)
-    candidates.append(spread[np.argsort(-away, kind="stable")])
-    return next((point for point in np.concatenate(candidates) if is_new(point) and steady(point)), None)
+    every, others = np.arange(known.shape[1]), np.random.default_rng(len(known)).random((256, known.shape[1]))
+    away = np.abs(others[:, None] - known).max(axis=2).min(axis=1, initial=1.0)
+    candidates.append(others[np.argsort(-away, kind="stable")])
+    for point in np.concatenate(candidates):
+        if is_new(point, every):
+            moved = point if spread is None else spread(point, known)
+            if (moved is point or seen is None or is_new(point, seen)) and steady(moved):
+                return moved
+    return None

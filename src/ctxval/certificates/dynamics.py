@@ -77,7 +77,7 @@ class Dynamics(CertificateKind):
                 "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "
                 "controller can be designed."
             )
-        evidence = replace(evidence, tests=self.tests)
+        evidence = evidence.needing(self.tests)
         certificate = certify_dynamics(sample, evidence, confidence)
         if threshold is None or certificate.covers(threshold):
             return certificate

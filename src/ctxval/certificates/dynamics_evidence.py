@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import rank_of
-from ctxval.certificates.prediction_tests import TESTS
+from ctxval.certificates.prediction_tests import MANY, TESTS
 from ctxval.core.coverage import StateInputCoverage, StateInputGap, StatePocket, UntriedCorner
 from ctxval.core.quantiles import LEVELS, QUANTILE, chance_of_more
 from ctxval.core.trial import Origin
@@ -179,6 +179,13 @@ class DynamicsEvidence(ShortRepr):
         rows = np.random.default_rng(0).integers(len(blocks), size=(200, len(blocks)))
         resampled = np.sort(blocks[rows].reshape(200, -1), axis=1)[:, self.rank(confidence)]
         return float(resampled.std(ddof=1)) if np.isfinite(resampled).all() else np.inf
+
+    def needing(self, tests: int) -> Self:
+        """Return the same for so many tests, or for twice as many if M ignores a parameter and they are no draws.
+
+        Only executions can tell what such a parameter changes, and one hypercube misses most boxes of two parameters.
+        """
+        return replace(self, tests=2 * tests if self.untried is not None and tests < MANY else tests)
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes in types that JSON has; numbers may be infinite."""

@@ -94,6 +94,13 @@ class DynamicsStudy(ShortRepr):
         """The indices of the task parameters that hardly change the closed loops of M."""
         return unseen_parameters(self.planner, self.search.pool[:8])
 
+    @property
+    def seen_parameters(self) -> Rows:
+        """The indices of the other task parameters; of all if none changes the closed loops of M."""
+        every = np.arange(self.validation.space.dimension)
+        seen = np.setdiff1d(every, self.unseen_parameters)
+        return seen if len(seen) else every
+
     def learn(self, executed: Executed, logged: Sequence[Trajectory] = ()) -> LearnedDynamics | None:
         """Return what executions, and recordings that belong to no task, teach; None if it is nothing."""
         extended, logged = self.extended.executions(executed), () if self.extended.needs_tasks else logged
