@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ctxval import TaskSpace
-from ctxval.certificates.envelope_shape import ENOUGH, Region, Surfaces, regions_inside
+from ctxval.certificates.envelope_shape import ENOUGH, MANY, MULTIPLES, Region, Surfaces, regions_inside
 
 SPACE = TaskSpace(payload=(0.0, 2.0, "kg"), goal=(-1.0, 1.0, "m"), start=(-1.0, 1.0, "m"))
 
@@ -92,8 +92,7 @@ def test_what_is_left_out_is_what_the_others_interpolate() -> None:
     surfaces = Surfaces.through(points, values)
     for k in range(0, 30, 3):
         others = np.delete(np.arange(30), k)
-        fewer = Surfaces.through(points[others], values[others])
-        without = fewer.__class__(fewer.centres, fewer.weights, fewer.left_out, np.zeros((29, 2)))(points[k])
+        without = Surfaces.through(points[others], values[others], surfaces.scales).with_errors(0.0)(points[k])
         np.testing.assert_allclose(surfaces.left_out[k], without, atol=1e-6)
         errors = np.abs(np.minimum(values[k], ENOUGH) - np.minimum(without, ENOUGH))
         np.testing.assert_allclose(surfaces.errors[k], errors, atol=1e-6)
@@ -112,10 +111,42 @@ def test_points_that_are_known_to_be_above_the_limit_raise_the_errors() -> None:
     rng = np.random.default_rng(3)
     known, more = rng.random((60, 2)), rng.random((900, 2))
     waves = [0.8 + 0.4 * np.sin(40 * points[:, :1]) for points in (known, more)]
-    surfaces = Surfaces.through(known, waves[0])
+    surfaces = Surfaces.through(known, waves[0], np.ones(2))
     inside = surfaces(more)[:, 0] <= 1
     checked, outside = int(inside.sum()), more[inside & (waves[1][:, 0] > 1)]
     assert len(outside) > 0.05 * checked
     raised = surfaces.without(outside, checked)
     assert (raised(outside) <= 1).mean() < 0.5
     np.testing.assert_allclose(surfaces.without(outside[:0], checked).errors, surfaces.errors)
+
+
+def test_many_checks_show_that_errors_are_too_large() -> None:
+    rng = np.random.default_rng(4)
+    points, more = rng.random((150, 3)), rng.random((2000, 3))
+    surfaces = Surfaces.through(points, bowl(points)[:, :1]).with_errors(10.0)
+    least = surfaces.with_errors(MULTIPLES[0])
+    checks = more[least(more)[:, 0] <= 1][:MANY]
+    outside = checks[bowl(checks)[:, 0] > 1]
+    lowered = surfaces.without(outside, len(checks))
+    assert lowered.errors.sum() < surfaces.errors.sum()
+    true = bowl(more)[:, 0] > 1
+    assert ((lowered(more)[:, 0] <= 1) & true).mean() < 0.01
+    assert (surfaces(more)[:, 0] <= 1).mean() <= (lowered(more)[:, 0] <= 1).mean() <= 1 - true.mean() + 0.01
+    few = surfaces.without(outside[:0], MANY - 1)
+    np.testing.assert_allclose(few.errors, surfaces.errors)
+
+
+def test_a_parameter_without_effect_is_made_short() -> None:
+    rng = np.random.default_rng(6)
+    points, others = rng.random((150, 4)), rng.random((500, 4))
+
+    def values(points: np.ndarray) -> np.ndarray:
+        return np.asarray(np.sin(5 * points[:, :1]) + 0.5 * np.cos(4 * points[:, 1:2]) + 1e-3 * points[:, 2:3] ** 2)
+
+    surfaces = Surfaces.through(points, values(points))
+    assert surfaces.scales[2:].max() < 0.3 * surfaces.scales[:2].min()
+    errors = [
+        np.abs(each.with_errors(0.0)(others) - values(others)).mean()
+        for each in (surfaces, Surfaces.through(points, values(points), np.ones(4)))
+    ]
+    assert errors[0] < 0.3 * errors[1]

@@ -240,9 +240,10 @@ class EnvelopeSearch:
             return drawn  # each further task costs a design of its own
         candidates = np.random.default_rng(1).random((_CANDIDATES, space.dimension))
         # Tasks next to the boundary at which closed loops are run, beside those of the pool.
-        count = 64 if noisy else 512
-        nearest = boundary_tasks(drawn, evidence, self._threshold, self._confidence, candidates, count)
-        return drawn.and_others(self._at(learned, nearest))
+        for count in (64,) if noisy else (512,) * max(space.dimension // 2, 1):
+            nearest = boundary_tasks(drawn, evidence, self._threshold, self._confidence, candidates, count)
+            drawn = drawn.and_others(self._at(learned, nearest))
+        return drawn
 
     def _at(self, learned: LearnedDynamics, points: Array, *, settled: bool = True) -> DrawnDistances:
         draws = draws_for(self._confidence)

@@ -47,7 +47,7 @@ from ctxval.certificates.dynamics_diagnostics import (
     untried_parameter,
 )
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
-from ctxval.certificates.envelope_shape import Region, Surfaces, exported, regions_inside, write_onnx
+from ctxval.certificates.envelope_shape import MANY, MULTIPLES, Region, Surfaces, exported, regions_inside, write_onnx
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.sentences.statements import IRREGULAR, dynamics_assumptions, envelope_statement
 from ctxval.core.space import TaskSpace
@@ -108,13 +108,15 @@ class DrawnDistances(ShortRepr):
         """Return how far loops leave records, by ``most`` at most, and places ``(K,)``: above 1 they do so too far."""
         return np.asarray(np.maximum(self.beyond / most, self.away))
 
+    def departures(self, most: float) -> Array:
+        """Return how far loops leave records, leave places, and cross the boundary ``(K, 3)``: above 1 too far."""
+        # All have the same slope: smaller slopes cost more of the set, because their errors reach farther.
+        crossing = np.zeros(len(self.points)) if self.crossed is None else (most + self.crossed) / most
+        return np.minimum(np.stack([self.beyond / most, self.away, crossing], axis=1), LARGEST)
+
     def leaving(self, most: float) -> Array:
-        """Return how far loops leave records and places, or cross the boundary ``(K,)``; nothing is known above 1."""
-        leaving = self.uncovered(most)
-        if self.crossed is not None:
-            # Both have the same slope: smaller slopes cost more of the set, because their errors reach farther.
-            leaving = np.maximum(leaving, (most + self.crossed) / most)
-        return np.asarray(np.minimum(leaving, LARGEST))
+        """Return the largest departure ``(K,)``; nothing is known of tasks above 1."""
+        return np.asarray(self.departures(most).max(axis=1))
 
     def upper(self, factor: float, threshold: float) -> Array:
         """Return mean + k spread as shares of the threshold ``(K,)``, at most ``LARGEST``."""
@@ -259,7 +261,8 @@ def boundary_tasks(
 ) -> Array:
     """Return at most so many of other tasks ``(N, d)``: those that are nearest to the boundary of the envelope."""
     surfaces = _interpolated(drawn, evidence, threshold, _raised(drawn, evidence, threshold, confidence)[0], ())
-    near = np.argsort(np.abs(surfaces(tasks)[:, 0] - 1), kind="stable")[: 3 * count]
+    largest = surfaces.with_errors(0.0)(tasks).max(axis=1)
+    near = np.argsort(np.abs(largest - 1), kind="stable")[: 3 * count]
     reach = 0.25 * count ** (-1 / tasks.shape[1])
     return np.asarray(tasks[near][separated_rows(tasks[near], reach, count)])
 
@@ -310,20 +313,20 @@ def _interpolated(
     factor: float,
     executed: Sequence[tuple[Array, float]],
 ) -> Surfaces:
-    """Return the surfaces of the bounds and, if loops of trusted tasks leave the records, of by how much."""
-    leaving = drawn.leaving(most_beyond(evidence))
-    points, values = drawn.points, np.stack([drawn.upper(factor, threshold), leaving], axis=1)
+    """Return the surfaces of the bounds, and of the departures of loops of tasks whose bounds keep the threshold."""
+    departures = drawn.departures(most_beyond(evidence))
+    points, values = drawn.points, np.column_stack([drawn.upper(factor, threshold), departures])
     for point, distance in executed:
         if distance > threshold and evidence.quantile is None:
             far = np.abs(points - point).max(axis=1) > _SAME_TASK
             ratio = float(np.clip(distance / threshold, _EXCEEDED, LARGEST))
             points = np.concatenate([points[far], point[None]])
-            values = np.concatenate([values[far], [[ratio, 0.0]]])
+            values = np.concatenate([values[far], [[ratio, 0.0, 0.0, 0.0]]])
     _, rows = np.unique(points.round(9), axis=0, return_index=True)
     points, values = points[np.sort(rows)], values[np.sort(rows)]
-    if not ((values[:, 1] > 1) & (values[:, 0] <= 1)).any():
-        values = values[:, :1]
-    return Surfaces.through(points, values)
+    matters = (values > 1) & (values[:, :1] <= 1)
+    matters[:, 0] = True
+    return Surfaces.through(points, values[:, matters.any(axis=0)])
 
 
 def envelope_of(
@@ -366,8 +369,10 @@ def envelope_of(
         envelope = _of_suite(envelope, space, drawn, most_beyond(evidence), executed)
     else:
         surfaces = _interpolated(drawn, evidence, threshold, factor, executed)
-        tasks = space.unit_draws(COUNTED, np.random.default_rng(2))
-        tasks = tasks[(surfaces(tasks) <= 1).all(axis=1)][:checks]
+        tasks, least = space.unit_draws(COUNTED, np.random.default_rng(2)), surfaces
+        if checks >= MANY:
+            least = surfaces.with_errors(MULTIPLES[0])
+        tasks = tasks[(least(tasks) <= 1).all(axis=1)][:checks]
         if evaluate is not None and len(tasks):
             checked = evaluate(tasks)
             outside = (checked.upper(factor, threshold) > 1) | (checked.leaving(most_beyond(evidence)) > 1)

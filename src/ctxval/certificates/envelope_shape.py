@@ -2,7 +2,7 @@
 
 The interpolant is the smoothest one in the sense of Duchon (1977): a sum of ``|p - p_j|^3`` and a linear function. Its
 errors are known without any further task: what each task would be if it were interpolated from the others follows from
-one inverse matrix (Rippa 1999).
+one inverse matrix (Rippa 1999). By these errors, the scale of each parameter is chosen.
 
 The sides of a box are limits on parameters and, of two parameters with the same unit, on their sum and difference. A
 box without a task outside of the set grows from a task inside it until each side meets such a task. The best one of
@@ -16,7 +16,7 @@ import inspect
 import io
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,10 @@ from ctxval.core.space import TaskSpace
 
 ENOUGH = 1.2  # multiple of the limit up to which an error of what exceeds it matters
 FALSE = 0.005  # share of the checked points that may be below the limit falsely
-_MULTIPLES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # of the errors
+MANY = 256  # checked points from which on errors may also turn out to be too large: then multiples are below 1
+MULTIPLES = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # of the errors
+_SCALED = 500  # tasks by which scales are chosen
+_SCALES = 0.02, 50.0  # smallest and largest one
 _NUGGET = 1e-9  # added to the matrix, so that two tasks that are nearly the same do not make it singular
 REGIONS = 3  # largest number of regions
 LEAST = 0.02  # least share of the tasks that a region holds and no larger one
@@ -60,7 +63,8 @@ def upper_at(points: Array, centres: Array, weights: Array, errors: Array) -> Ar
 class Surfaces:
     """Upper bounds of c numbers over the unit cube: interpolated, plus the largest local error."""
 
-    centres: Array  #: the tasks at which the numbers are known, shape ``(K, d)``
+    scales: Array  #: what parameters are multiplied by, shape ``(d,)``
+    centres: Array  #: the tasks at which the numbers are known, scaled, shape ``(K, d)``
     weights: Array  #: shape ``(K + 1 + d, c)``
     left_out: Array  #: what each number would be if its task were left out, shape ``(K, c)``
     #: by how much that is wrong, shape ``(K, c)``; the largest of the nearest is the local error. Its sign does not
@@ -68,12 +72,16 @@ class Surfaces:
     errors: Array
 
     @classmethod
-    def through(cls, points: Array, values: Array) -> Surfaces:
+    def through(cls, points: Array, values: Array, scales: Array | None = None) -> Surfaces:
         """Return the surfaces of values ``(K, c)`` at different points ``(K, d)``, K at least d + 2.
 
         The values are shares of a limit. How far they exceed it does not matter, so an error counts up to ``ENOUGH``.
+        If no scales are given, they are chosen.
         """
         K, d = points.shape
+        if scales is None:
+            scales = _scales(points, values)
+        points = points * scales
         tail = np.concatenate([np.ones((K, 1)), points], axis=1)
         matrix = np.zeros((K + 1 + d, K + 1 + d))
         matrix[:K, :K] = cdist(points, points) ** 3 + _NUGGET * np.eye(K)
@@ -82,20 +90,48 @@ class Surfaces:
         weights = inverse[:, :K] @ values
         left_out = values - weights[:K] / np.diag(inverse)[:K, None]
         errors = np.abs(np.minimum(values, ENOUGH) - np.minimum(left_out, ENOUGH))
-        return cls(points, weights, left_out, errors)
+        return cls(scales, points, weights, left_out, errors)
 
     def without(self, outside: Array, checked: int) -> Surfaces:
-        """Return these surfaces with larger errors, so that hardly any of the points ``(n, d)`` outside is inside."""
-        for multiple in _MULTIPLES:
-            raised = replace(self, errors=multiple * self.errors)
+        """Return these surfaces with the least errors with which hardly any of the points ``(n, d)`` outside is inside.
+
+        The points are those of ``checked`` ones that lie outside of the set.
+        """
+        for multiple in MULTIPLES if checked >= MANY else MULTIPLES[MULTIPLES.index(1.0) :]:
+            raised = self.with_errors(multiple)
             if (raised(outside) <= 1).all(axis=-1).sum() <= FALSE * checked:
                 break
         return raised
 
+    def with_errors(self, multiple: float) -> Surfaces:
+        """Return these surfaces with errors that are multiplied."""
+        return replace(self, errors=multiple * self.errors)
+
     def __call__(self, points: Array) -> Array:
         """Return the upper bounds ``(..., c)`` at points ``(..., d)``."""
-        upper = upper_at(points.reshape(-1, points.shape[-1]), self.centres, self.weights, self.errors)
+        scaled = points.reshape(-1, points.shape[-1]) * self.scales
+        upper = upper_at(scaled, self.centres, self.weights, self.errors)
         return np.asarray(upper.reshape(*points.shape[:-1], self.weights.shape[1]))
+
+
+def _scales(points: Array, values: Array) -> Array:
+    """Return scales ``(d,)`` with small errors: one after the other is doubled or halved while these fall."""
+    rows = np.random.default_rng(0).permutation(len(points))[:_SCALED]
+    points, values = points[rows], values[rows]
+
+    def error(scales: Array) -> float:
+        return float(np.sqrt((Surfaces.through(points, values, scales).errors ** 2).mean(axis=0)).sum())
+
+    scales = np.ones(points.shape[1])
+    least = error(scales)
+    for j, factor in [*product(range(len(scales)), (0.5, 2.0))] * 2:
+        while True:
+            tried = scales.copy()
+            tried[j] *= factor
+            if not _SCALES[0] < tried[j] < _SCALES[1] or (smaller := error(tried)) > 0.995 * least:
+                break
+            scales, least = tried, smaller
+    return scales
 
 
 _EXPORTED = '''# {made_by}. This file needs NumPy alone.
@@ -113,6 +149,7 @@ NAMES = {names!r}  # the parameters of a task, in this order
 LABELS = {labels!r}  # with their units
 LOW = np.array({low!r})
 HIGH = np.array({high!r})
+SCALES = np.array({scales!r})
 THRESHOLD = {threshold!r}
 CONFIDENCE = {confidence!r}
 
@@ -134,7 +171,7 @@ def trusted(task):
     unit = (task - LOW) / (HIGH - LOW)
     inside = ((unit >= 0) & (unit <= 1)).all(axis=-1)
     rows = np.where(inside[..., None], unit, 0.5).reshape(-1, len(NAMES))
-    upper = upper_at(rows, CENTRES, WEIGHTS, ERRORS).reshape(*inside.shape, -1)
+    upper = upper_at(rows * SCALES, CENTRES, WEIGHTS, ERRORS).reshape(*inside.shape, -1)
     kept = inside & (upper <= 1).all(axis=-1)
     bound = np.where(kept, THRESHOLD * np.maximum(upper[..., 0], 0), np.inf)
     return kept[()], bound[()]
@@ -169,6 +206,7 @@ def exported(surfaces: Surfaces, space: TaskSpace, statement: str, threshold: fl
         names=list(space.names),
         low=space.low.tolist(),
         high=space.high.tolist(),
+        scales=surfaces.scales.tolist(),
         threshold=threshold,
         confidence=confidence,
         centres=literal(surfaces.centres),
@@ -185,7 +223,7 @@ def write_onnx(path: str | Path, surfaces: Surfaces, space: TaskSpace, threshold
     outermost = unit.node("Sub", np.array(0.5)).node("Abs").node("ReduceMax", axes=[1], keepdims=0)
     inside = outermost.node("LessOrEqual", np.array(0.5 + 1e-9))
 
-    limited = unit.node("Min", np.array(1.0)).node("Max", np.array(0.0))
+    limited = unit.node("Min", np.array(1.0)).node("Max", np.array(0.0)).affine(np.diag(surfaces.scales), np.zeros(d))
     squares = limited.squared_distances(surfaces.centres, np.ones(d))
     K, c = surfaces.errors.shape
     smooth = (squares * squares.node("Sqrt")).affine(surfaces.weights[:K], surfaces.weights[K])
