@@ -24,15 +24,15 @@ from strangers_reporting import REPORTING
 from strangers_truths import SEEDS, TRUTHS
 
 RULE = 11
-"""Version of the rule by which campaigns are run: 11 tests twice as often if M ignores a task parameter, of which
-tasks are no new ones by its value alone; 10 spreads the values of parameters that change no prediction, so
-that only campaigns of systems with such parameters differ from 9, and the others have its number; 9 looks beside a
-failed test only if what is learned does not explain it by now, so that only campaigns with drawn tests differ from 8,
-and the others have its number; 8 enters places of positions after the tests, so that only campaigns of systems with
-positions that are validated differ from 7; 7 executes the corners of positions, so that those of systems without
-positions are as by rule 6; 5 tests again after a test that failed, if what is learned explains it by now; 4 finds task
-parameters that change the dynamics, and leaves out data of M that contradict the executions; 3 learns histories and
-noise, and tests are points of a hypercube."""
+"""Version of the rule by which campaigns are run: 11 tests twice as often if M ignores a task parameter, of which tasks
+are no new ones by its value alone, so that only campaigns of systems with such a parameter differ from 10, and the
+others have its number; 10 spreads the values of parameters that change no prediction, so that only campaigns of systems
+with such parameters differ from 9, and the others have its number; 9 looks beside a failed test only if what is learned
+does not explain it by now, so that only campaigns with drawn tests differ from 8, and the others have its number; 8
+enters places of positions after the tests, so that only campaigns of systems with positions that are validated differ
+from 7; 7 executes the corners of positions, so that those of systems without positions are as by rule 6; 5 tests again
+after a test that failed, if what is learned explains it by now; 4 finds task parameters that change the dynamics, and
+leaves out data of M that contradict the executions; 3 learns histories and noise; tests are points of a hypercube."""
 
 BUDGET = 25
 FALSE, TRUE = (0.8, 0.95, 0.99), (1.1, 1.25, 1.5)

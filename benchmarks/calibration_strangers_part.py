@@ -14,8 +14,8 @@ TEXT = """## Systems of strangers
 {systems} systems were written to embarrass the verdict, {reporting} of which are reported here and were never tuned on.
 Their dynamics depend on the task, have contacts and small places that matter, hidden modes, heat, hysteresis, backlash,
 stall, slip, rate limits, delays, loads or wind, or M is far from its data. Campaigns run as a user runs them, with the
-default certificate, eight tests and at most {budget} executions, until they are decided against a threshold of a known
-share of d*. {count} campaigns are stored.
+default certificate and its tests, with at most {budget} executions, until they are decided against a threshold of a
+known share of d*. {count} campaigns are stored.
 
 **At 0.95 d*, {false} of {below} campaigns were validated, which is false ({share:.1f} %; the 95 % interval is
 {low:.1f} to {high:.1f} %).**{regular}
