@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -376,6 +377,25 @@ def test_no_task_is_executed_a_second_time() -> None:
         known = np.concatenate([known, fresh[None]])
     everywhere = np.stack(np.meshgrid(*[np.linspace(0, 1, 60)] * 2), axis=-1).reshape(-1, 2)
     assert next_task(contested, everywhere, 0.2, 2.0, 0.95) is None
+
+
+def test_a_task_is_new_by_the_parameters_that_change_predictions() -> None:
+    contested, seen = evidence(), np.array([0])
+    farthest, at_bound = contested.coverage.task, contested.points[38]
+
+    def moved(task: np.ndarray, known: np.ndarray) -> np.ndarray:
+        return np.array([task[0], 0.123])
+
+    def chosen(known: np.ndarray, spread: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> list[float]:
+        task = next_task(contested, known, 0.2, 2.0, 0.95, spread=spread, seen=seen)
+        assert task is not None
+        return list(task.tolist())
+
+    away, with_another_value = np.array([[1 - farthest[0], 0.5]]), np.array([[farthest[0], 1 - farthest[1]]])
+    assert chosen(away, moved) == [farthest[0], 0.123]
+    assert chosen(with_another_value, moved) == [at_bound[0], 0.123]
+    # A task that is not moved differs in predictions, too, so it is new by any parameter.
+    assert chosen(with_another_value, lambda task, known: task) == farthest.tolist()
 
 
 def test_beside_a_failed_test_the_task_is_looked_for_that_it_would_make_worse() -> None:

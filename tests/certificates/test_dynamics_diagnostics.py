@@ -217,3 +217,13 @@ def test_a_test_that_failed_is_outlived_by_tests_and_not_by_other_executions() -
     assert not only_a_failed_test(with_([*later, chosen]), best, bound, 2.0)
     uncovered_ = replace(raised_by_it, coverage=replace(COVERED, beyond=gap(0.5)))
     assert not only_a_failed_test(uncovered_, best, bound, 2.0)
+
+
+def test_a_parameter_that_m_ignores_needs_twice_as_many_tests() -> None:
+    ignored = replace(GOOD, untried=UntriedParameter("load", 0.1, np.zeros(2)))
+    assert [evidence.needing(8).tests for evidence in (GOOD, ignored)] == [8, 16]
+    assert ignored.needing(22).tests == 22  # independent draws
+    assert ignored.needing(0).tests == 0
+    tested = replace(ignored, predictions=(*GOOD.predictions, *TESTS))
+    assert doubt(tested.needing(4)) is None
+    assert "8 more executions must be predicted" in (doubt(tested.needing(8)) or "")
