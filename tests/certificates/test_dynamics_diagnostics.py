@@ -220,8 +220,9 @@ def test_a_test_that_failed_is_outlived_by_tests_and_not_by_other_executions() -
 
 
 def test_a_parameter_that_m_ignores_needs_twice_as_many_tests() -> None:
-    ignored = replace(GOOD, untried=UntriedParameter("load", 0.1, np.zeros(2)))
-    assert [evidence.needing(8).tests for evidence in (GOOD, ignored)] == [8, 16]
+    ignored = replace(GOOD, untried=UntriedParameter("load", 0.1, np.zeros(2), idle=True))
+    obstacle = replace(GOOD, untried=UntriedParameter("obstacle", 0.1, np.zeros(2)))
+    assert [evidence.needing(8).tests for evidence in (GOOD, obstacle, ignored)] == [8, 8, 16]
     assert ignored.needing(22).tests == 22  # independent draws
     assert ignored.needing(0).tests == 0
     tested = replace(ignored, predictions=(*GOOD.predictions, *TESTS))

@@ -218,6 +218,7 @@ def test_values_of_a_parameter_that_changes_no_prediction_are_spread_over_its_ra
     executed = [(point, validation.execute(validation.plan(point))) for point in np.array([[1.0, 0.2], [0.0, 0.8]])]
     learned = DynamicsStudy(validation).learn(executed)
     assert learned is not None
+    assert learned.has_idle
     known = np.empty((0, 2))
     for _ in range(5):
         moved = learned.spread_unseen(task, known)
@@ -229,4 +230,5 @@ def test_values_of_a_parameter_that_changes_no_prediction_are_spread_over_its_ra
     executed = [(point, validation.execute(validation.plan(point))) for point, _ in executed]
     learned = DynamicsStudy(validation).learn(executed)
     assert learned is not None
+    assert not learned.has_idle
     np.testing.assert_array_equal(learned.spread_unseen(task, known), task)

@@ -237,7 +237,7 @@ class CampaignDynamics:
             tuple(predictions),
             learned.coverage,
             unplanned=worst.unplanned,
-            untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
+            untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:], learned.has_idle),
             corner=untried_corner(learned.executed, self.study.validation.space, learned.coverage.task),
             sharpness=worst.sharpness,
             dense=worst.points.shape[1] <= DENSE and self.study.planner.batched,

@@ -71,6 +71,7 @@ class UntriedParameter(ShortRepr):
     name: str  #: its name
     gap: float  #: the largest distance of one of its values to the nearest executed one, as a share of its range
     task: Array  #: a task in that gap, a point of the unit cube ``(d,)``
+    idle: bool = False  #: whether a parameter of this kind changes no predicted distance either; not of a suite
 
 
 @dataclass(frozen=True)
@@ -181,11 +182,12 @@ class DynamicsEvidence(ShortRepr):
         return float(resampled.std(ddof=1)) if np.isfinite(resampled).all() else np.inf
 
     def needing(self, tests: int) -> Self:
-        """Return the same for so many tests, or for twice as many if M ignores a parameter and they are no draws.
+        """Return the same for so many tests, or for twice as many if a parameter is idle and they are no draws.
 
         Only executions can tell what such a parameter changes, and one hypercube misses most boxes of two parameters.
         """
-        return replace(self, tests=2 * tests if self.untried is not None and tests < MANY else tests)
+        idle = self.untried is not None and self.untried.idle
+        return replace(self, tests=2 * tests if idle and tests < MANY else tests)
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes in types that JSON has; numbers may be infinite."""

@@ -230,6 +230,20 @@ class LearnedDynamics(ShortRepr):
         task[j] = value
         return j, gap, task
 
+    @functools.cached_property
+    def has_idle(self) -> bool:
+        """Whether an unseen parameter changes no predicted distance either, unlike the place of an obstacle."""
+        space, some = self.study.validation.space, self.study.search.pool[:8]
+        if space.members is not None:
+            return False
+        for j in self.study.unseen_parameters:
+            low, high = some.copy(), some.copy()
+            low[:, j], high[:, j] = 0.0, 1.0
+            below, above = self.expected(np.concatenate([low, high])).reshape(2, -1)
+            if np.isclose(below, above, rtol=0.05, atol=0, equal_nan=True).all():
+                return True
+        return False
+
     def spread_unseen(self, task: Array, known: Array) -> Array:
         """Return a task ``(d,)`` with values of the unseen parameters that are far from those of known ones ``(n, d)``.
 
