@@ -161,8 +161,7 @@ class EnvelopeSearch:
         if interval.best <= self._threshold or not interval.predicts or not recorder.has_tasks:
             return None
         known = self._known(trials)
-        missing = 0 if known is None else known[1].tests - _stored_tests(recorder, trials)
-        if known is None or not 0 < self._left <= missing:
+        if known is None or not 0 < self._left <= known[1].tests - _stored_tests(recorder, trials):
             return None
         return None if self._regular(trials, known[1]) is None else interval.test()
 

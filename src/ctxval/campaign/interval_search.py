@@ -256,9 +256,10 @@ class IntervalSearch:
         failed = [trial for trial in trials if trial.state == "failed"]
         known, waiting = self._points([*self._ended, *failed]), waiting_points(trials)
         # Tasks that differ in parameters that change no prediction are one task, with values that are spread.
-        spread, seen = None, self.recorder.dynamics.study.seen_parameters
+        spread: Callable[[Array, Array], Array] | None = None
+        seen: Rows | slice = slice(None)
         if learned is not None and self._suite is None:
-            spread = learned.spread_unseen
+            spread, seen = learned.spread_unseen, learned.study.seen_parameters
         point = next_task(evidence, known, best, limit, confidence, steady, self._near, spread, seen)
         if len(waiting) and (point is None or np.abs(waiting - point)[:, seen].max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.
@@ -364,7 +365,7 @@ def next_task(
     steady: Callable[[Array], bool] = lambda point: True,
     near: float = NEAR,
     spread: Callable[[Array, Array], Array] | None = None,
-    seen: Rows | None = None,
+    seen: Rows | slice = slice(None),
 ) -> Array | None:
     """Return the task to execute next, a point ``(d,)``; None if all tasks lie next to executed ones.
 
@@ -402,7 +403,7 @@ def next_task(
     else:
         candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]
 
-    def is_new(point: Array, by: Rows) -> bool:
+    def is_new(point: Array, by: Rows | slice = slice(None)) -> bool:
         others, task = known[:, by], point[by]
         close = others[np.abs(others - task).max(axis=1) <= near]
         # A start may jump between tasks, so the closed loop next to an executed task may lead elsewhere.
@@ -410,12 +411,12 @@ def next_task(
         return len(close) < most and not (close == task).all(axis=1).any()
 
     # Of random tasks, the one farthest from all known tasks comes first.
-    every, others = np.arange(known.shape[1]), np.random.default_rng(len(known)).random((256, known.shape[1]))
+    others = np.random.default_rng(len(known)).random((256, known.shape[1]))
     away = np.abs(others[:, None] - known).max(axis=2).min(axis=1, initial=1.0)
     candidates.append(others[np.argsort(-away, kind="stable")])
     for point in np.concatenate(candidates):
-        if is_new(point, every):
+        if is_new(point):
             moved = point if spread is None else spread(point, known)
-            if (moved is point or seen is None or is_new(point, seen)) and steady(moved):
+            if (moved is point or is_new(point, seen)) and steady(moved):
                 return moved
     return None
