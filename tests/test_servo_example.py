@@ -99,6 +99,7 @@ def test_a_campaign_falsifies_m1_and_sees_only_what_it_executes(servo: ModuleTyp
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_one_recording_counts_for_all_compared_models(servo: ModuleType) -> None:
     models = {friction: servo.experiment(friction=friction).validation for friction in ("m3", "m4")}
     found = compare(models, question="worst", budget=1)

@@ -22,7 +22,7 @@ ROBOTS = {**DEVELOPMENT, **REPORTING}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", some(ROBOTS))
+@pytest.mark.parametrize("name", some(ROBOTS, 12))
 def test_a_robot_without_a_fault_does_what_its_model_does(name: str) -> None:
     validation = ROBOTS[name].experiment(Fault("none"), 0.0, 0).validation
     plan = validation.plan(0.3 * validation.space.low + 0.7 * validation.space.high)

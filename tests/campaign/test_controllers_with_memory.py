@@ -63,6 +63,7 @@ def test_a_campaign_ends_with_a_verdict_and_the_prediction_runs_many_memories_at
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_workers_and_a_resumed_campaign_have_the_same_distances(tmp_path: Path) -> None:
     largest = truth()
     made = validation(system=systems.Function(alone))

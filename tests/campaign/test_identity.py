@@ -239,11 +239,13 @@ def test_a_failure_cannot_be_dropped(store: Path) -> None:
     "search",
     [
         SEARCH(beta=3.0, noise=(1e-6, 0.5)),
-        *more(searches.Auto(40)),
         searches.Auto("fast"),
-        searches.Random(),
-        searches.SamplingDiscarding(2),
-        searches.Repeated(searches.BayesianOptimisation(initial=2), 2),
+        *more(
+            searches.Auto(40),
+            searches.Random(),
+            searches.SamplingDiscarding(2),
+            searches.Repeated(searches.BayesianOptimisation(initial=2), 2),
+        ),
     ],
     ids=repr,
 )
@@ -315,6 +317,7 @@ def experiment(seed=0):
 """
 
 
+@pytest.mark.thorough
 def test_no_output_has_a_value_that_the_system_uses_and_such_values_may_change(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

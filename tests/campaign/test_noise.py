@@ -93,6 +93,7 @@ def test_measurement_noise_that_hardly_moves_a_distance_is_no_end() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_initial_states_that_scatter_are_noise_too() -> None:
     validation = cart(0.0, start=0.03)
     largest = largest_quantile(validation)

@@ -41,6 +41,7 @@ def test_people_execute_the_same_tasks_as_a_campaign_that_runs_by_itself(share: 
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_each_task_is_predicted_beforehand_and_a_reopened_store_goes_on(tmp_path: Path) -> None:
     case = cases.by_name("linear", 1, dim=1)
     assert case.truth is not None

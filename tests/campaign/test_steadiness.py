@@ -18,6 +18,7 @@ from ctxval.core.model import Model
 from ctxval.core.trial import UNSTEADY
 from ctxval.errors import InputError
 from ctxval.learning.closed_loops import LoopPlanner
+from rig_thorough import more
 
 ACCIDENTS = 0.4
 """Share of the tasks with an accident."""
@@ -85,7 +86,9 @@ def test_the_tasks_of_a_search_are_steady(search: searches.Search) -> None:
         assert campaign.validation.outcome(space.point(trial.parameters)).distance == trial.distance
 
 
-@pytest.mark.parametrize("search", [searches.Auto("fast"), searches.CMAES(), searches.Repeated(searches.GPUCB(), 2)])
+@pytest.mark.parametrize(
+    "search", [searches.Auto("fast"), *more(searches.CMAES(), searches.Repeated(searches.GPUCB(), 2))]
+)
 def test_a_resumed_campaign_chooses_the_same_tasks(search: searches.Search, tmp_path: Path) -> None:
     def tasks(campaign: Campaign) -> list[Any]:
         return [(trial.parameters, trial.unit_point.tolist(), trial.note) for trial in campaign.trials]

@@ -71,6 +71,7 @@ def test_a_distance_above_the_threshold_ends_the_campaign() -> None:
     assert campaign.executions < 8
 
 
+@pytest.mark.thorough
 def test_a_noisy_task_is_not_repeated() -> None:
     noisy = systems.Imperfect(step, vectorized=True, process=[0.0, 0.02], seed=1)
     campaign = Campaign(validation(system=noisy), seed=0).run(50, 0.9)

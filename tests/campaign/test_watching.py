@@ -17,6 +17,7 @@ from ctxval.certificates import WatchState
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.errors import CertificateError, ExecutionError, InputError
+from rig_thorough import more
 
 THRESHOLD = 0.5
 
@@ -176,7 +177,7 @@ def with_load(mass: float = 1.0) -> Validation:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [recording_outputs, with_load])
+@pytest.mark.parametrize("make", [recording_outputs, *more(with_load)])
 def test_outputs_and_physical_parameters_are_watched(make: Callable[..., Validation]) -> None:
     def run(validation: Validation, goal: float, load: float) -> tuple[Trajectory, dict[str, float]]:
         task = {"goal": goal, "load": load} if "load" in validation.space.names else {"goal": goal}

@@ -271,6 +271,7 @@ finally:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_worker_that_is_signalled_while_it_ends_does_not_go_on_as_the_campaign(tmp_path: Path) -> None:
     done = run_python("-c", SIGNALLED_AT_ITS_END, folder=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -36,6 +36,7 @@ def test_the_expected_wealth_is_one_if_the_signs_are_fair(sizes: np.ndarray, rec
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @given(values=hnp.arrays(np.float64, 12, elements=NUMBERS), factor=st.floats(1e-3, 1e3))
 def test_swapping_and_scaling_carry_over(values: np.ndarray, factor: float) -> None:
     one, other = mean_difference(paired(values), 0.05), mean_difference(paired(-values), 0.05)

@@ -244,6 +244,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return seeds
 
 
+@pytest.mark.thorough
 def test_far_from_the_threshold_the_draws_are_those_of_one_seed(usual: Maxima, monkeypatch: pytest.MonkeyPatch) -> None:
     seeds = counted(monkeypatch)
     for threshold in (1e-3, 1e3):

@@ -44,6 +44,7 @@ def store(stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return "a.sqlite"
 
 
+@pytest.mark.thorough
 def test_an_audit_for_a_region_is_drawn_and_certified_in_one_command(searched: Path, tmp_path: Path) -> None:
     store = str(shutil.copy(searched, tmp_path / "a.sqlite"))
     arguments = (

@@ -217,6 +217,7 @@ def test_an_unusable_option_is_not_blamed_on_the_file(invoke) -> None:  # type: 
     assert "e.toml: threshold must be a positive number, got -3.0." in invoke("run", "e.toml").stderr
 
 
+@pytest.mark.thorough
 def test_certify_says_that_the_campaign_was_decided_otherwise(invoke) -> None:  # type: ignore[no-untyped-def]
     invoke("run", "rig:experiment", "--store", "a.sqlite", "--threshold", "9", "--budget", "4")
     hint = "`ctxval certify a.sqlite --kind auto`"
@@ -487,6 +488,7 @@ def test_a_scenario_bound_of_a_budget_that_was_raised_is_refused(invoke) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_run_names_what_its_verdict_rests_on_and_the_other_campaigns(invoke) -> None:  # type: ignore[no-untyped-def]
     invoke("run", "rig:experiment", "--budget", "7")  # each later execution needs a bound
     arguments = ("run", "rig:experiment", "--budget", "12", "--threshold", "90", "--resolution", "0.6", "--tests", "0")
@@ -505,6 +507,7 @@ def test_a_run_names_what_its_verdict_rests_on_and_the_other_campaigns(invoke) -
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_certificate_tells_its_resolution_in_the_units_of_the_stored_task_space(invoke) -> None:  # type: ignore[no-untyped-def]
     space = TaskSpace(goal=(-3.0, 3.0, "rad"), load=([0.0, 0.0], [1.0, 2.0], "kg"))
     validation = make_validation()
@@ -543,6 +546,7 @@ def test_an_audit_waits_for_what_people_are_executing(invoke, campaigns: dict[st
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_store_that_no_command_made_cannot_be_audited_but_certified(invoke) -> None:  # type: ignore[no-untyped-def]
     Campaign(make_validation(), store="own.sqlite").run(6, explore=True)
     result = invoke("certify", "own.sqlite", "--audit", "3")
@@ -668,6 +672,7 @@ def test_every_help_text_is_a_sentence() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize(("reader", "status"), [*more(("ended", 141)), ("full disk", 2)])
 def test_an_error_that_cannot_be_written_as_json_keeps_its_exit_status(
     tmp_path: Path, reader: str, status: int

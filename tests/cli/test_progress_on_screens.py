@@ -120,6 +120,7 @@ def test_a_log_has_a_line_for_each_trial(folder: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_asking_and_waiting_for_the_lock_are_shown(folder: Path) -> None:
     assert calling("ask")("rig:by_hand", "--store", "a.sqlite").exit_code == 0
     with held(folder):

@@ -101,6 +101,7 @@ def falsified(invoke: Invoke) -> str:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_falsified_store_is_refined_until_the_model_is_validated(invoke: Invoke, folder: Path) -> None:
     pytest.importorskip("onnxruntime")
     store = falsified(invoke)

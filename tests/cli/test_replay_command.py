@@ -158,6 +158,7 @@ def test_a_model_is_an_onnx_file_with_options(invoke: Invoke) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_an_experiment_predicts_its_worst_tasks_and_names_the_states(invoke: Invoke) -> None:
     Path("cart.toml").write_text(EXPERIMENT)
     found = report(invoke("logs", "--experiment", "cart.toml", "--executions", "3", "--seed", "1", "--json"))

@@ -106,6 +106,7 @@ def test_it_finds_the_margin_and_other_commands_read_its_store(folder: Path, inv
     assert "unsafe: wall = " in asked.stdout
 
 
+@pytest.mark.thorough
 def test_check_says_what_the_model_does(folder: Path, invoke: Invoke) -> None:
     checked = invoke("check", "wall.toml")
     assert checked.exit_code == 0

@@ -85,6 +85,7 @@ def test_what_cannot_be_read_is_said_in_one_sentence(tmp_path: Path) -> None:
     assert not list((tmp_path / "start").glob("*"))
 
 
+@pytest.mark.thorough
 def test_an_observer_is_loaded_from_the_folder_of_its_mapping(logs: Path, tmp_path: Path) -> None:
     (tmp_path / "apart").mkdir()
     (tmp_path / "apart" / "an_observer.py").write_text(OBSERVER)

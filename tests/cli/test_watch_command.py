@@ -97,6 +97,7 @@ def test_a_table_of_runs_is_judged_and_nothing_is_stored(folder: Path, invoke: I
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_system_that_is_executed_is_validated_anew_in_another_store(folder: Path, invoke: Invoke) -> None:
     """`ctxval ask` would open a trial that only people execute."""
     from watched_cart import experiment  # type: ignore[import-not-found]
@@ -112,6 +113,7 @@ def test_a_system_that_is_executed_is_validated_anew_in_another_store(folder: Pa
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_the_next_command_has_the_options_of_the_campaign(folder: Path, invoke: Invoke) -> None:
     run = calling("run", "watched_cart:experiment")
     made = run("--option", "mass=1.05", "--seed", "3", "--explore", "--budget", "6", "--store", "option.sqlite")
@@ -123,6 +125,7 @@ def test_the_next_command_has_the_options_of_the_campaign(folder: Path, invoke: 
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_trajectory_with_its_task_and_recordings_without(folder: Path, invoke: Invoke) -> None:
     one = report(invoke("same0.csv", "--set", "goal=-1.5", "--json"))
     names = [each["name"] for each in one["watch"]["channels"] if each["later"] != [None]]

@@ -175,6 +175,7 @@ def test_a_truth_is_found_once(tmp_path: Path) -> None:
     assert only_file(tmp_path / "new" / "folder").suffix == ".json"
 
 
+@pytest.mark.thorough
 def test_another_validation_and_other_settings_have_other_truths(tmp_path: Path) -> None:
     def narrower(p: Parameters) -> Task:
         return Task(0.5 * p.points, horizon=1, dt=0.1)

@@ -13,6 +13,7 @@ from ctxval.errors import InputError
 from ctxval.gp import regression
 from ctxval.gp.cholesky import factorise
 from ctxval.gp.kernels import Matern
+from rig_thorough import more
 
 KERNELS: dict[str, Matern] = {
     "matern32": Matern(1.5),
@@ -220,7 +221,7 @@ def oracle_optimum(kernel: Matern, X: np.ndarray, y: np.ndarray, noise: tuple[fl
         return float(regressor.fit(X, y).log_marginal_likelihood_value_)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *more(1, 2)])
 @pytest.mark.parametrize("noise", [(regression.NOISE, regression.NOISE), (1e-6, 1.0)])
 @pytest.mark.parametrize("kernel", [Matern(1.5), Matern(2.5, ard=True)])
 def test_the_fit_is_as_likely_as_the_best_of_scikit_learn(

@@ -109,6 +109,7 @@ def test_none_is_found_where_inputs_act_at_once() -> None:
     assert found(cart(measurement=(0.01, 0.02)), 8) is None
 
 
+@pytest.mark.thorough
 def test_none_is_found_where_a_state_is_hidden_that_is_no_actuator() -> None:
     @dataclass
     class Oscillating:

@@ -108,6 +108,7 @@ def test_a_page_is_written_where_it_is_asked_for_and_never_over_a_store(tmp_path
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("scheme", ["light", *more("dark")])
 def test_a_page_is_quiet_small_and_accessible(browser: Any, tmp_path: Path, scheme: Any) -> None:
     path = write_replay_page(with_tasks(report(12, 400)), tmp_path / "page.html", name="arm", units="m")

@@ -54,12 +54,13 @@ def run(search: Search, function: Function, budget: int, dimension: int = 2, see
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize(("dimension", "budget"), [(1, 12), (2, 20), (6, 40)])
+@pytest.mark.parametrize(("dimension", "budget"), [*more((1, 12)), (2, 20), *more((6, 40))])
 def test_it_finds_the_top_of_a_hill(dimension: int, budget: int, seed: int) -> None:
     assert run(BayesianOptimisation(), peak, budget, dimension, seed).max() > 0.98
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", SEEDS)
 def test_it_finds_the_highest_corner_of_a_folded_plane(seed: int) -> None:
     values = run(BayesianOptimisation(), fold, 40, 8, seed)

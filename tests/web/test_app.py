@@ -466,6 +466,7 @@ def test_other_computers_need_the_token_and_the_store_may_be_run_elsewhere(tmp_p
     assert [trial.state for trial in trials(tmp_path)] == ["completed", "failed"]
 
 
+@pytest.mark.thorough
 def test_the_server_ends_at_once_although_a_task_is_being_chosen(tmp_path: Path) -> None:
     new_store(tmp_path, "my_rig:slow")
     recording = record(tmp_path / "a.trials" / "0", tmp_path / "run.csv").read_bytes()

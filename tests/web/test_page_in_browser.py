@@ -107,7 +107,7 @@ def address(folder: Path) -> Iterator[str]:
         yield server.address
 
 
-def test_a_whole_campaign_by_hand_of_two_operators_and_a_phone(browser: Any, folder: Path, address: str) -> None:
+def test_a_whole_campaign_by_hand_of_two_operators(browser: Any, folder: Path, address: str) -> None:
     first = Operator(browser, folder, address, accept_downloads=True)
     second = Operator(browser, folder, address, accept_downloads=True)
     number = first.opened()
@@ -132,10 +132,10 @@ def test_a_whole_campaign_by_hand_of_two_operators_and_a_phone(browser: Any, fol
     assert first.errors == []
     assert [trial.state for trial in stored(folder)] == ["completed"] * 4
 
-    for one in (first, second):
-        one.context.close()
-    ctxval("ask", "a.sqlite", "--explore", folder=folder)
-    ctxval("tell", "a.sqlite", "4", "--distance", "3", folder=folder)
+
+@pytest.mark.thorough
+def test_a_falsification_on_a_phone(browser: Any, folder: Path, address: str) -> None:
+    ctxval("tell", "a.sqlite", "0", "--distance", "3", folder=folder)
     ctxval("ask", "a.sqlite", "--explore", folder=folder)
     phone = Operator(browser, folder, address, viewport={"width": 400, "height": 800}, color_scheme="dark")
     phone.opened()
@@ -331,6 +331,7 @@ def test_the_entrance_is_accessible_and_the_token_leaves_the_address(browser: An
         assert two.page.url == bare
 
 
+@pytest.mark.thorough
 def test_a_run_is_shown_as_it_goes_and_takes_nothing(browser: Any, tmp_path: Path) -> None:
     case = ("linear", "--option", "dim=1", "--seed", "1")
     command = [*SMALL, "run", *case, "--threshold", "90", "--tests", "0", "--live"]

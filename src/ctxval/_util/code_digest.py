@@ -68,7 +68,12 @@ def is_library(value: Any) -> bool:
     file = getattr(module, "__file__", None)
     if file is None or is_own(module) or {"site-packages", "dist-packages"} & set(Path(file).parts):
         return True
-    return any(Path(file).is_relative_to(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib"))
+    return any(Path(file).is_relative_to(folder) for folder in _standard_library())
+
+
+@functools.cache
+def _standard_library() -> list[str]:
+    return [sysconfig.get_path(name) for name in ("stdlib", "platstdlib")]
 
 
 def enclosed(function: types.FunctionType) -> list[Any]:

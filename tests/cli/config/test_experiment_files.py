@@ -404,7 +404,7 @@ def test_a_model_whose_batches_differ_is_found() -> None:
     assert (state, "differs from the steps one by one" in text) == ("failed", True)
 
 
-@pytest.mark.parametrize("batched", [True, False])
+@pytest.mark.parametrize("batched", [True, *more(False)])
 def test_a_system_without_inputs_has_none_to_name(batched: bool) -> None:
     validation = make_validation_without_inputs(batched)
     validation.task = lambda p: Task(np.stack([p.a, p.b], axis=-1), goal=[0.0, 0.0], horizon=5, dt=0.1)
@@ -631,7 +631,7 @@ FILTERED = (
 )
 
 
-@pytest.mark.parametrize(("outputs", "synthesizer"), [*more(("[0]", PID)), ('"angles:angle"', PID), ("[0]", FILTERED)])
+@pytest.mark.parametrize(("outputs", "synthesizer"), [*more(("[0]", PID), ("[0]", FILTERED)), ('"angles:angle"', PID)])
 def test_outputs_are_indices_or_a_function_of_a_module(outputs: str, synthesizer: str, invoke: Any) -> None:
     sys.modules.pop("angles", None)
     Path("angles.py").write_text(

@@ -276,6 +276,7 @@ def test_the_file_of_init_is_checked_from_another_folder(here: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_command_from_another_folder_finds_what_the_file_names(here: Path) -> None:
     described(here / "one", "x * 0.5")
     program = [sys.executable, "-m", "ctxval"]

@@ -287,6 +287,7 @@ def test_a_signature_of_another_store_serves_only_the_settings_that_it_is_of(fol
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_module_beside_a_copied_store_is_not_found(folder: Path) -> None:
     rig_store(folder)
     elsewhere = folder / "downloads"

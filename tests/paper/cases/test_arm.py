@@ -164,6 +164,7 @@ def test_a_campaign_runs_on_it(experiment: Experiment) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_aspects_are_the_distances_to_the_targets(aspects: dict[str, arm.Aspects]) -> None:
     whole = arm.experiment(1, "gp", SMALL).validation
     to_goal = Validation(
@@ -193,6 +194,7 @@ def test_the_gaussian_process_does_the_tasks_and_the_linear_model_does_not(aspec
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [0, *more(1)])
 def test_the_gaussian_process_mimics_the_arm_best_and_the_linear_model_worst(seed: int) -> None:
     settings = replace(arm.Settings(), restarts=1, training=300)

@@ -115,6 +115,7 @@ def test_a_mass_that_is_a_fifth_off_is_found_within_its_confidence_interval(vect
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_confidence_intervals_contain_the_truth_as_often_as_they_say() -> None:
     inside = np.zeros(2)
     for seed in range(24):

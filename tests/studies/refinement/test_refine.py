@@ -80,6 +80,7 @@ def test_the_shares_of_the_rounds_sum_up_to_alpha() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_fit_that_memorises_is_not_validated() -> None:
     """Its distance is zero on each task that it has seen, which is no evidence on any other task."""
     found = refine(campaign(), THRESHOLD, 4, method=memory)

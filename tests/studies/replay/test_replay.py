@@ -313,6 +313,7 @@ def test_recordings_predict_the_worst_task_of_the_pendulum_before_any_execution(
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_recordings_of_a_small_region_are_said_to_be_left() -> None:
     experiment = by_name("pendulum", 0)
     runs = [experiment.validation.execute(experiment.validation.plan([goal])) for goal in (2.9, 3.0, 3.1)]
