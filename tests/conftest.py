@@ -59,6 +59,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 TESTS = Path(__file__).parent
 IN_FULL = ("certificates", "gp", "learning", "searches")
 """Folders whose subject are the draws and the closed loops."""
+LONGEST = ("test_page_in_browser.py", "test_recipes.py", "test_report_browser.py", "test_clusters.py")
 
 get_group = typer.main.get_group
 groups: dict[tuple[int, int], Any] = {}
@@ -96,7 +97,9 @@ def pytest_xdist_auto_num_workers() -> int | None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the tests that only `make thorough` runs."""
+    """Put the longest tests first, and leave out those that only `make thorough` runs."""
+    # The longest ones first: otherwise one process still has them if the others have nothing left.
+    items.sort(key=lambda item: item.path.name not in LONGEST)
     if not config.getoption("thorough"):
         left_out = [item for item in items if item.get_closest_marker("thorough")]
         config.hook.pytest_deselected(items=left_out)

@@ -55,7 +55,7 @@ def base() -> Iterator[Path]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("family", some(attack.FAMILIES, 2))
+@pytest.mark.parametrize("family", some(attack.FAMILIES, 3))
 def test_hostile_input_ends_in_a_sentence(family: str, base: Path) -> None:
     for number in range(EACH[family]):
         # Other inputs than those of the large run.

@@ -267,6 +267,7 @@ def test_stored_campaigns_end_within_one_per_cent_or_with_their_budget() -> None
         assert result["truth"] in [record["distance"] for record in TRUTHS.select(plant=case, seed=seed)]
 
 
+@pytest.mark.thorough
 def test_a_campaign_is_run_once_and_only_auto_has_versions(tmp_path: Path) -> None:
     results, truths = JsonLines(tmp_path / "plants.jsonl", STORED.key), JsonLines(tmp_path / "truths.jsonl", TRUTHS.key)
     record = TRUTHS["cart-pole", 0, digest(PLANTS["cart-pole"].make)]

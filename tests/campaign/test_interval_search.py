@@ -425,6 +425,7 @@ def asked(found: DynamicsEvidence, known: np.ndarray, threshold: float, best: fl
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_without_a_threshold_it_ends_when_the_interval_is_narrow() -> None:
     validation, largest = linear()
     campaign = Campaign(validation).run(20)

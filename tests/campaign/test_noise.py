@@ -80,6 +80,7 @@ def test_without_noise_nothing_changes() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_measurement_noise_that_hardly_moves_a_distance_is_no_end() -> None:
     """It is a large part of what M misses, and a small one of the distance: the bound is one on the quantile."""
     noisy = systems.Imperfect(step, vectorized=True, measurement=[3e-4, 3e-4], seed=1)

@@ -78,6 +78,7 @@ def test_a_noisy_task_is_not_repeated() -> None:
     assert max(Counter(names(campaign)).values()) == 1
 
 
+@pytest.mark.thorough
 def test_a_resumed_campaign_makes_the_same_choices(tmp_path: Path) -> None:
     whole = Campaign(validation(), seed=3).run(5, 9.0)
     for budget in (3, 5):

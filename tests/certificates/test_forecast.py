@@ -54,6 +54,7 @@ def test_what_the_bound_leaves_undecided_takes_at_least_one_execution(
     assert expected.executions is None or expected.executions >= 1
 
 
+@pytest.mark.thorough
 def test_a_forecast_is_the_same_twice(sample: Sample, found: Maxima) -> None:
     tau = 0.5 * (sample.best + found.upper(CONFIDENCE))
     first, again = (forecast(sample, found, tau, CONFIDENCE, seed=3, futures=4) for _ in range(2))

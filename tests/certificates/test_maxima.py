@@ -93,6 +93,7 @@ def test_no_bound_is_below_the_largest_distance_that_was_executed(d: int) -> Non
     assert Posterior().certify_drawn(trials, maxima, 0.01).upper_bound >= trials.best
 
 
+@pytest.mark.thorough
 def test_units_do_not_matter(usual: Maxima) -> None:
     np.testing.assert_allclose(quick(sample(factor=4.0)).draws, 4 * usual.draws, rtol=1e-6)
     own = Prior(offset=None)  # the logarithm's zero is that of the distance

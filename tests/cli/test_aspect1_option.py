@@ -59,6 +59,7 @@ def test_a_model_that_does_not_exits_as_falsified_and_names_the_worst_task() -> 
     assert "of 20 tasks within 1e-06 m: the worst of 20 tasks is goal = " in text
 
 
+@pytest.mark.thorough
 def test_people_read_the_same_sentences() -> None:
     done = CliRunner().invoke(app, ["check", "cart.toml", "--aspect1", "--tasks", "8"])
     assert done.exit_code == 0

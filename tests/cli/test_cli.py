@@ -269,6 +269,7 @@ def test_an_interrupt_says_how_to_go_on(invoke) -> None:  # type: ignore[no-unty
     assert "run the same command to resume" in result.stderr
 
 
+@pytest.mark.thorough
 def test_a_confidence_that_no_bound_can_have_does_not_lose_the_report(invoke) -> None:  # type: ignore[no-untyped-def]
     given = ("--budget", "4", "--threshold", "9", "--confidence", "0.9999999", "--report", "--json")
     result = invoke("run", "rig:experiment", *given)
@@ -602,6 +603,7 @@ def test_what_is_no_store_is_not_exported(invoke) -> None:  # type: ignore[no-un
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_reader_that_goes_away_is_no_error(tmp_path: Path) -> None:
     command = f"{sys.executable} -c 'from ctxval.cli import main; main()' cases --help | head -c 1"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, cwd=tmp_path)

@@ -66,6 +66,7 @@ def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Invoke:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_two_files_are_compared_and_the_result_is_printed_and_written(invoke: Invoke) -> None:
     said = invoke("gentle.toml", "stiff.toml", "--question", "mean", "--out", "result.md")
     assert said.exit_code == 0, said.stderr

@@ -28,6 +28,7 @@ def test_without_a_threshold_there_is_no_envelope(tmp_path: Path, monkeypatch: p
     assert "an envelope needs --threshold" in refused.output
 
 
+@pytest.mark.thorough
 def test_one_that_is_not_stated_says_why_and_writes_no_function(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -145,6 +145,7 @@ def test_an_experiment_is_run_first_and_the_answer_is_said(whole: tuple[Result, 
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_parameters_of_a_function_are_estimated_and_written(invoke: Invoke) -> None:
     store = falsified(invoke)
     given = ("--step", "refined_plant:law", "--parameter", "linear=[0, 2]", "--parameter", "square=[0, 2]")

@@ -97,6 +97,7 @@ def cliff(dimension: int, seed: int, share: float = 1.5e-4) -> Values:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("dimension", [3, *more(2, 4)])
 def test_it_finds_rare_cliffs(dimension: int) -> None:
     found = [search(cliff(dimension, seed), dimension, seed, 9000).values[0] for seed in range(5)]

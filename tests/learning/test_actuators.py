@@ -150,6 +150,7 @@ def test_the_posterior_is_of_the_inputs_that_act_and_predicts_what_is_recorded()
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("few_loops")
 def test_a_distance_of_inputs_sees_what_is_commanded() -> None:
     def effort(model: Any, system: Any, task: Task) -> Any:

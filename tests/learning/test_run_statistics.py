@@ -97,6 +97,7 @@ def test_what_matters_is_many_times_what_is_negligible(smooth: tuple[RunStatisti
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_noise_gives_statistics_near_one_and_coefficients(noisy: tuple[RunStatistics, list[float]]) -> None:
     statistics, distances_ = noisy
     assert statistics.has_noise

@@ -176,6 +176,7 @@ FEW = WorstCaseSettings(pool=64, evaluations=300, elites=6, shared=6, moves=4, r
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_equal_seeds_give_equal_maxima_whatever_was_computed_before() -> None:
     known, posterior = np.array([[0.9, 0.2]]), learned()
     used = WorstCaseSearch(make_planner(2), 3, FEW)

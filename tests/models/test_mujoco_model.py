@@ -94,6 +94,7 @@ def test_a_state_that_is_not_finite_or_at_which_mujoco_warns_has_no_next_state(
     assert np.isfinite(reached).all(axis=1).tolist() == [True, False, False]
 
 
+@pytest.mark.thorough
 def test_it_is_the_model_of_a_campaign_and_repeats_itself_in_a_store(tmp_path: Path) -> None:
     validation = Validation(
         space=TaskSpace(goal=(-1.0, 1.0, "rad")),

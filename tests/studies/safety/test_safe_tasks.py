@@ -40,6 +40,7 @@ def test_a_drift_with_one_wall_has_its_closed_form() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_campaign_certifies_the_margin_that_the_drift_needs() -> None:
     campaign = Campaign(validation(), seed=0).run(20, explore=False, progress=False)
     found = assess(campaign, tasks=2000, progress=False)
