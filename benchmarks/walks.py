@@ -1,10 +1,11 @@
-"""How many functions of the package a reader passes on two ways through it, at revisions and in this checkout.
+"""How many functions of the package a reader passes on three ways through it, at revisions and in this checkout.
 
 A recorded trajectory until it changes the next suggestion: ``Campaign.tell`` and ``Campaign.ask``. A threshold until
-its sentence: ``Campaign.verdict``, as text. Both are those of the paper's pendulum, with executions that learned
-dynamics follow from. Functions are counted once, whatever the number of calls; lambdas and comprehensions are parts of
-the functions that they stand in. ``python benchmarks/walks.py 6387a59`` prints those of a revision beside those of this
-checkout; ``--list`` prints the functions of this checkout by file.
+its sentence: ``Campaign.verdict``, as text. A task until its distance: ``Validation.distances`` of one task.
+All are those of the paper's pendulum, with executions that learned dynamics follow from. Functions are counted once,
+whatever the number of calls; lambdas and comprehensions are parts of the functions that they stand in.
+``python benchmarks/walks.py 6387a59`` prints those of a revision beside those of this checkout; ``--list`` prints the
+functions of this checkout by file.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from landed import tree_of
 HERE = Path(__file__).resolve()
 TOLD, EXECUTIONS = "a recorded trajectory, until the next suggestion", 6
 JUDGED = "a threshold, until its sentence"
+MEASURED = "a task, until its distance"
 
 
 def functions_of(action: Callable[[], object], package: Path) -> list[str]:
@@ -58,12 +60,16 @@ def walk() -> dict[str, list[str]]:
     def judged() -> Any:
         return str(other.verdict(3 * other.worst.distance))  # so far above that a bound is computed
 
+    def measured() -> Any:
+        return experiment.validation.distances([[1.0]])
+
     package = Path(ctxval.__file__).parent
     experiment = cases.by_name("pendulum")
     campaign, other = (Campaign(experiment.validation, seed=1).run(EXECUTIONS) for _ in range(2))
     opened = campaign.ask()
     trajectory = experiment.validation.system.execute(opened.plan.controller, opened.plan.task)
-    return {TOLD: functions_of(told, package), JUDGED: functions_of(judged, package)}
+    ways = {TOLD: told, JUDGED: judged, MEASURED: measured}
+    return {name: functions_of(action, package) for name, action in ways.items()}
 
 
 def main() -> None:
@@ -84,11 +90,11 @@ def main() -> None:
         walks.append(json.loads(output.stdout.splitlines()[-1]))
     print(f"| | {' | '.join([*options.revisions, 'now'])} |")
     print("|---" * (1 + len(walks)) + "|")
-    for name in (TOLD, JUDGED):
+    for name in (TOLD, JUDGED, MEASURED):
         counts = (f"{len(each[name])} in {len({entry.partition(':')[0] for entry in each[name]})}" for each in walks)
         print(f"| {name}: functions, in files | {' | '.join(counts)} |")
     if options.list:
-        print(*(f"\n{name}\n" + "\n".join(walks[-1][name]) for name in (TOLD, JUDGED)), sep="\n")
+        print(*(f"\n{name}\n" + "\n".join(walks[-1][name]) for name in (TOLD, JUDGED, MEASURED)), sep="\n")
 
 
 if __name__ == "__main__":

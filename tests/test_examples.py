@@ -68,6 +68,7 @@ def test_an_example_prints_what_it_promises_and_leaves_nothing_behind(
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [SHORTEST, *more(*(name for name in PRINTED if name != SHORTEST))])
 def test_an_example_runs_as_a_reader_runs_it(name: str, tmp_path: Path) -> None:
     """In a process of its own, with as many draws and closed loops as the reader's."""

@@ -69,6 +69,7 @@ def test_one_execution_above_the_threshold_is_not_enough() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_without_noise_nothing_changes() -> None:
     campaign = Campaign(cart(0.0), seed=0).run(20, 0.5, certificate=FEW_TESTS)
     verdict = campaign.verdict(0.5, certificate=FEW_TESTS)

@@ -93,6 +93,7 @@ def test_workers_never_run_the_same_task_at_the_same_time(seed: int) -> None:
         assert gaps.min() > NEAR
 
 
+@pytest.mark.thorough
 def test_spare_workers_that_decide_execute_different_tasks() -> None:
     validation = linear(2)
     pool, campaign = Pool(validation, 4), Campaign(validation, search=searches.Auto("fast"))

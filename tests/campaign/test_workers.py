@@ -469,6 +469,7 @@ def ended(store: Path) -> int:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("workers", [*more(1), 3])
 def test_the_first_interrupt_ends_after_the_running_executions(tmp_path: Path, workers: int) -> None:
     store, marks = tmp_path / "a.sqlite", tmp_path / "marks"

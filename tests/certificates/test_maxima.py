@@ -15,6 +15,7 @@ from ctxval.certificates import (
 from ctxval.certificates.maxima import _MOST, MOST, representative
 from ctxval.errors import CertificateError, InputError
 from ctxval.gp.hyperposterior import Prior
+from rig_thorough import more
 
 confidences = st.floats(0.01, 0.999)
 numbers = st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=60)
@@ -83,7 +84,7 @@ def test_a_confidence_that_is_no_probability_is_refused(confidence: float) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("d", [1, 3])
+@pytest.mark.parametrize("d", [1, *more(3)])
 def test_no_bound_is_below_the_largest_distance_that_was_executed(d: int) -> None:
     trials = sample(d=d)
     maxima = quick(trials)
@@ -201,6 +202,7 @@ def test_distances_that_differ_by_rounding_are_refused() -> None:
         draw_maxima(of(sample().points, 1 + 2.3e-16 * np.arange(9)))
 
 
+@pytest.mark.thorough
 def test_one_task_with_two_distances_is_not_deterministic() -> None:
     X, y = sample().points.copy(), sample().distances
     X[5] = X[2]
@@ -278,6 +280,7 @@ def test_many_trials_are_represented_by_the_largest_and_well_spread_ones() -> No
     assert set(np.sort(many.distances)[-MOST // 4 :]) <= set(kept.distances)
 
 
+@pytest.mark.thorough
 def test_a_bound_of_many_trials_says_that_it_uses_some_of_them() -> None:
     many = sample(400)
     certificate = Posterior().certify_drawn(many, quick(many), 0.9)

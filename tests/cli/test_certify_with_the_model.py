@@ -70,6 +70,7 @@ def test_an_audit_for_a_region_is_drawn_and_certified_in_one_command(searched: P
     assert report["upper_bound"] == 0.5
 
 
+@pytest.mark.thorough
 def test_a_region_speaks_to_a_person_and_executes_nothing(store: str) -> None:
     before = Store.existing(Path(store)).trials()
     text = " ".join(invoke("certify", store, "--kind", "region", "--threshold", "0.38").stdout.split())
@@ -82,6 +83,7 @@ def test_a_region_speaks_to_a_person_and_executes_nothing(store: str) -> None:
     assert len(Store.existing(Path(store)).trials()) == len(before) == 36
 
 
+@pytest.mark.thorough
 def test_a_counterexample_stands_beside_the_map(store: str) -> None:
     result = invoke("certify", store, "--kind", "region", "--threshold", "0.2", "--json")
     report = json.loads(result.stdout)

@@ -126,6 +126,7 @@ def test_a_lerobot_data_set_needs_no_mapping(invoke: Invoke) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_model_is_a_file_a_reference_or_that_of_an_experiment(invoke: Invoke) -> None:
     A, B = np.array([[1.0, DT], [0.0, 1.0]]), np.array([[0.0], [DT]])
     np.savez("model.npz", A=A, B=B)

@@ -11,6 +11,7 @@ import pytest
 from ctxval import Parameters, Task, TaskSpace, Truth, Validation, controllers, distances, grid_truth, systems
 from ctxval.core.truth import cached_truth, search_truth
 from ctxval.errors import InputError
+from rig_thorough import more
 
 Surface = Callable[[np.ndarray], np.ndarray]
 TOP = np.array([0.3, 0.8, 1.0])
@@ -63,7 +64,7 @@ def test_a_grid_of_failures_has_no_truth() -> None:
 # By search
 
 
-@pytest.mark.parametrize("surface", [hill, two_peaks])
+@pytest.mark.parametrize("surface", [*more(hill), two_peaks])
 def test_a_search_finds_a_known_maximum(surface: Surface) -> None:
     validation = of_surface(surface)
     truth = search_truth(validation, generations=60)
@@ -123,6 +124,7 @@ def test_climbs_find_a_narrow_peak_that_evolution_passes_by() -> None:
     assert found[0] <= found[1]
 
 
+@pytest.mark.thorough
 def test_failed_executions_are_searched_around() -> None:
     truth = search_truth(of_surface(lambda x: np.where(x[..., 0] < 0.5, np.nan, hill(x))), generations=60)
     assert truth.distance == pytest.approx(2 - 0.3 * 0.2**2, abs=1e-4)

@@ -132,6 +132,7 @@ def test_none_is_found_where_a_state_is_hidden_that_is_no_actuator() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("few_loops")
 def test_the_posterior_is_of_the_inputs_that_act_and_predicts_what_is_recorded() -> None:
     validation = cart(delay=1.3)

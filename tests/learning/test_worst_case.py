@@ -17,6 +17,7 @@ from ctxval.learning.closed_loops import LoopPlanner, loop_pairs
 from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings
+from rig_thorough import more
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 
@@ -104,7 +105,7 @@ def grid(dimension: int) -> Array:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dimension", [1, 2])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, *more(1)])
 def test_maxima_are_those_of_a_dense_grid(dimension: int, seed: int) -> None:
     planner, posterior = make_planner(dimension), remembering()
     search = WorstCaseSearch(planner, seed, WorstCaseSettings.for_dimension(dimension))

@@ -191,6 +191,7 @@ def test_told_its_history_late_and_in_another_order_it_asks_for_the_same_point(t
     assert fresh.ask(1).shape == (1, 5)
 
 
+@pytest.mark.thorough
 def test_a_suggestion_after_a_thousand_values_takes_seconds_at_most() -> None:
     search = BayesianOptimisation()
     search.reset(20, 0)

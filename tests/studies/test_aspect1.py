@@ -81,6 +81,7 @@ def test_the_worst_task_is_that_of_a_dense_grid_and_the_share_of_bad_tasks_has_i
     assert len(found) == 1
 
 
+@pytest.mark.thorough
 def test_the_share_is_a_probability_under_the_distribution_of_tasks() -> None:
     validation = cart(controllers.LQR([10.0, 1.0], [0.1], limits=0.5))
     near = validation.with_parts(space=validation.space.distributed(goal=Normal(0.5, 0.05)))
@@ -106,6 +107,7 @@ def test_a_controller_that_flips_is_named_with_two_neighbours() -> None:
     assert report.completes is None  # without a threshold
 
 
+@pytest.mark.thorough
 def test_designs_that_do_not_converge_are_counted_and_named() -> None:
     pendulum = cases.by_name("pendulum", seed=0).validation
     hasty = controllers.ILQR([1.0, 0.1], [1e-4], [10.0, 1.0], iterations=1, tolerance=1e-12, limits=0.5)

@@ -225,7 +225,7 @@ def test_a_crash_ends_the_trajectory_and_not_the_process(deadly: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{}, {"workers": 2}])
+@pytest.mark.parametrize("options", [*more({}), {"workers": 2}])
 def test_a_crash_is_a_failed_trial_of_a_campaign(deadly: Path, options: dict[str, int]) -> None:
     validation = Validation(
         space=TaskSpace(speed=(50.0, 150.0, "m/s")),
@@ -320,6 +320,7 @@ def test_what_an_fmu_prints_and_reads_does_not_disturb(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_many_executions_and_garbage_collections_leave_the_process_alive(path: Path) -> None:
     # In a process of its own, which may crash.
@@ -350,6 +351,7 @@ def test_the_unpacked_files_go_with_the_system(path: Path) -> None:
     assert not folder.exists()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_it_can_be_sent_to_another_process(path: Path) -> None:
     system = FMU(path, **NAMES)

@@ -12,8 +12,7 @@ from rig_thorough import more
 
 CASES: list[tuple[str, dict[str, Any]]] = [
     ("pendulum", {}),
-    ("dubins", {}),
-    ("arm", {"model": "linear"}),
+    *more(("dubins", {}), ("arm", {"model": "linear"})),
     *more(("pendulum", {"variant": "biased"}), ("dubins", {"variant": "basin"}), ("dubins", {"variant": "heavy-tail"})),
     *more(("arm", {"model": "gp"}), ("arm", {"model": "fnn"})),
     ("linear", {"dim": 1}),

@@ -243,6 +243,7 @@ def test_a_distance_above_the_largest_possible_one_ends_the_comparison(tmp_path:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_failed_draw_leaves_the_expected_distance_open_unless_a_largest_one_is_stated() -> None:
     def breaks(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         if np.abs(x[..., 0]).max() > 1.0:
