@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 import webbrowser
 from collections.abc import Iterator
@@ -156,7 +157,12 @@ def run(
     failed = f", of which {report['failed']} failed" if report["failed"] else ""
     rows = {"executions": f"{report['executions']} of at most {total}{failed}"}
     shown_keys = ("worst", "truth", "error_percent", "store", "report")
-    print_table(rows | {key: report[key] for key in shown_keys if key in report}, units)
+    rows |= {key: report[key] for key in shown_keys if key in report}
+    if verdict is not None and verdict.answer == "falsified":
+        command = shlex.join(["ctxval", "why", str(path)])
+        holds = "" if envelope else "the same command with --envelope finds where M holds, "
+        rows["next"] = f"`{command}` tells what M lacks, {holds}and `ctxval refine` learns a better model"
+    print_table(rows, units)
     if verdict is not None:
         base.print_other_stores(report["other_stores"])
     if campaign.failed and not campaign.completed:

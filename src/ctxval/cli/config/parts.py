@@ -207,14 +207,15 @@ def named_experiment(text: str, seed: int, options: dict[str, Any], folder: Path
         return cases.by_name(text, seed, **options)
     experiment = reference(text, folder)
     if is_function(experiment) and not isinstance(experiment, Validation | Experiment):
-        if not accepts(experiment, 1, **options):
+        seeds = (seed,) if accepts(experiment, 1, **options) else ()
+        if not accepts(experiment, len(seeds), **options):
             given = f"{' ' if options else ''}{', '.join(options)}; it takes {inspect.signature(experiment)}"
             raise InputError(f"{text} must be callable with a seed and its options{given}.")
-        experiment = construct(text, experiment, options, seed)
+        experiment = construct(text, experiment, options, *seeds)
     if isinstance(experiment, Validation):
         return Experiment(text.partition(":")[2], experiment)
     if not isinstance(experiment, Experiment):
-        kinds = "an Experiment or a Validation, or a function of a seed that makes one"
+        kinds = "an Experiment or a Validation, or a function that makes one, of a seed if it needs one"
         raise InputError(f"{text} must be {kinds}, got {type(experiment).__name__}.")
     return experiment
 
