@@ -42,7 +42,7 @@ BUDGET, KEPT, CONFIDENCE = 15, 0.7, 0.95
 TASKS, NOISY_TASKS, REPEATS = 4000, 1000, 60
 
 SMOOTH = ("reactor", "heated-rooms", "boat-in-current", "ball-on-beam", "far-barge", "warm-bearing", "ground-effect")
-CONTACTS = ("table-top", "oblique-wall", "taut-tether")
+CONTACTS = ("table-top", "oblique-wall", "taut-tether", "thin-pillar", "slack-cable", "loose-wrist")
 NOISY = {
     "ship, noise": ("ship", "process 0.1 %"),
     "tanks, noise": ("tanks", "measurement 0.5 %"),
@@ -121,10 +121,11 @@ oblique-wall and taut-tether, which have positions. Version 7 found 97, 79 and 6
 46 %. The condition is that of a validation; without it, a patch of 0.12 m made 1.05 % of a puck's tasks falsely
 trusted. Version 9, the present one, interpolates better: its scales, columns, tasks at the boundary and errors were
 chosen on gripper-on-floor, moored-boat, rail-cars and corner-stop, after it was seen that the interpolation had lost
-most of what table-top and oblique-wall lacked.) Of each system, 70 % of the tasks keep the threshold. "Found" is the
-share of these tasks that the envelope trusts; "false" is the share of all tasks that it trusts although their true
-distance is larger. True sets are known at {tasks} random tasks, of noisy systems at {noisy_tasks} tasks by {repeats}
-executions each.
+most of what table-top and oblique-wall lacked. The last three contacts were added when the results of the others were
+known, and before their own were: no system of the reporting lists with contacts or backlash is left out.) Of each
+system, 70 % of the tasks keep the threshold. "Found" is the share of these tasks that the envelope trusts; "false" is
+the share of all tasks that it trusts although their true distance is larger. True sets are known at {tasks} random
+tasks, of noisy systems at {noisy_tasks} tasks by {repeats} executions each.
 [How to use an envelope](how-to/envelope.md) says what it is.
 
 **The median share found is {found:.0f} %. It is at least 80 % on {enough} of {systems} systems, of which {contacts}
