@@ -30,6 +30,9 @@ from ctxval.testing import FaultyRig
 
 validation = make_validation()
 
+def without_a_seed():
+    return make_validation()
+
 def experiment(seed=0, horizon=25):
     made = make_validation(horizon=horizon)
     return Experiment("short", made, budget=6, truth=lambda: truth.grid_truth(made, 101), units="rad")
@@ -132,6 +135,8 @@ def test_a_falsified_model_exits_with_1(invoke) -> None:  # type: ignore[no-unty
     result = invoke("run", "rig:experiment", "--threshold", "0.001", "--json")
     assert result.exit_code == 1
     assert json.loads(result.stdout)["verdict"] == "falsified"
+    text = " ".join(invoke("run", "rig:without_a_seed", "--threshold", "0.001").stdout.split())
+    assert "next `ctxval why runs/without_a_seed-" in text
 
 
 def test_the_human_report_names_the_worst_task_and_the_verdict(invoke) -> None:  # type: ignore[no-untyped-def]
