@@ -30,7 +30,7 @@ from ctxval.certificates import (
     draw_maxima,
 )
 from ctxval.certificates.expiry import Statistic, WatchedChannel, WatchState
-from ctxval.cli.config.settings import Settings
+from ctxval.cli.config.settings import ExperimentSettings
 from ctxval.core.trial import Origin, State
 from ctxval.data import Break, LogMapping, MemoryTable, recordings_of
 from ctxval.learning import ExecutionPrediction
@@ -63,7 +63,7 @@ def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_the_settings_of_a_named_experiment_are_valid() -> None:
     page = "docs/how-to/experiment-file.md"
-    settings = Settings.model_validate(tomllib.loads(block(page, "toml", 'experiment = "pendulum"')))
+    settings = ExperimentSettings.model_validate(tomllib.loads(block(page, "toml", 'experiment = "pendulum"')))
     assert settings.search.build().thinking == "balanced"  # type: ignore[attr-defined]
 
 

@@ -408,7 +408,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "studies.replay.PredictedTask": lambda: replay.PredictedTask({"goal": 1.5}, 0.4, 0.3, 0.6, 0.9),
     "studies.replay.PredictedTasks": lambda: replay.PredictedTasks((), 0.4, 0.6, (), 64, 0.0, 0.1, 1),
     "studies.replay.RecordedData": lambda: replayed().data,
-    "studies.replay.Region": lambda: replayed().regions[0],
+    "studies.replay.RegionalError": lambda: replayed().regions[0],
     "studies.replay.ReplayReport": lambda: replayed(),
     "studies.replay.ResidualShare": lambda: replayed().residuals[0],
     "studies.replay.StepError": lambda: replayed().errors[0],

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from ctxval import TaskSpace
-from ctxval.certificates.envelope_shape import ENOUGH, MANY, MULTIPLES, Region, Surfaces, regions_inside
+from ctxval.certificates.envelope_shape import ENOUGH, MANY, MULTIPLES, Surfaces, TrustedRegion, regions_inside
 
 SPACE = TaskSpace(payload=(0.0, 2.0, "kg"), goal=(-1.0, 1.0, "m"), start=(-1.0, 1.0, "m"))
 
 
-def found(space: TaskSpace, contains) -> tuple[Region, ...]:  # type: ignore[no-untyped-def]
+def found(space: TaskSpace, contains) -> tuple[TrustedRegion, ...]:  # type: ignore[no-untyped-def]
     unit = np.random.default_rng(5).random((2000, space.dimension))
     return regions_inside(space, unit, contains(unit), contains)
 
@@ -64,7 +64,7 @@ def test_all_tasks_and_none() -> None:
 
 
 def test_limits_in_words() -> None:
-    region = Region({"a [m]": (-0.5, 0.5), "b": (0.1, None), "c [s]": (1.0, 2.0)}, 0.2)
+    region = TrustedRegion({"a [m]": (-0.5, 0.5), "b": (0.1, None), "c [s]": (1.0, 2.0)}, 0.2)
     assert region.text == "|a| below 0.5 m and b above 0.1 and c from 1 to 2 s"
     assert region.to_json() == {"limits": {"a [m]": [-0.5, 0.5], "b": [0.1, None], "c [s]": [1.0, 2.0]}, "share": 0.2}
 

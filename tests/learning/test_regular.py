@@ -76,7 +76,7 @@ def test_executions_that_touched_it_can_be_left_out() -> None:
     assert split is not None
     without = split.posterior([6, 7])
     assert without is not None
-    assert not without[1].explanations  # nothing irregular is known
+    assert not without[1].discriminants  # nothing irregular is known
     assert set(without[0].data.sources) == set(range(6))
 
 

@@ -47,7 +47,15 @@ from ctxval.certificates.dynamics_diagnostics import (
     untried_parameter,
 )
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
-from ctxval.certificates.envelope_shape import MANY, MULTIPLES, Region, Surfaces, exported, regions_inside, write_onnx
+from ctxval.certificates.envelope_shape import (
+    MANY,
+    MULTIPLES,
+    Surfaces,
+    TrustedRegion,
+    exported,
+    regions_inside,
+    write_onnx,
+)
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.sentences.statements import IRREGULAR, dynamics_assumptions, envelope_statement
 from ctxval.core.space import TaskSpace
@@ -133,7 +141,8 @@ class Envelope(ShortRepr):
     confidence: float
     statement: str  #: what it says, in one sentence
     share: float = 0.0  #: the share of the tasks that are trusted
-    regions: tuple[Region, ...] = ()  #: the largest boxes and half-spaces inside it, the largest first; not for a suite
+    #: the largest boxes and half-spaces inside it, the largest first; not for a suite
+    regions: tuple[TrustedRegion, ...] = ()
     tasks: tuple[str, ...] | None = None  #: the names of the trusted tasks of a suite; None if it is no suite
     factor: float | None = None  #: k, by how many spreads the mean must stay below the threshold
     raised_by: int | None = None  #: the trial that raised k, as predictions or draws miss its distance; else None

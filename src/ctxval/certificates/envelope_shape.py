@@ -243,7 +243,7 @@ def write_onnx(path: str | Path, surfaces: Surfaces, space: TaskSpace, threshold
 
 
 @dataclass(frozen=True)
-class Region:
+class TrustedRegion:
     """A box of tasks, or a half-space if it has one limit."""
 
     #: the lower and the upper limit of parameters, or of a sum or a difference such as ``goal - start``, by their
@@ -275,7 +275,7 @@ class Region:
 
 def regions_inside(
     space: TaskSpace, unit: Array, inside: Mask, contains: Callable[[Array], Mask]
-) -> tuple[Region, ...]:
+) -> tuple[TrustedRegion, ...]:
     """Return the largest regions inside a set, the largest first, each without most of the tasks of those before.
 
     The points ``unit`` ``(N, d)`` have the distribution of the tasks; ``inside`` ``(N,)`` and ``contains`` say which
@@ -317,7 +317,7 @@ def regions_inside(
             if low > first or high < last:  # the limits that are not those of the task space
                 below = float(f"{low:.9g}") if low > first else None
                 limits[label] = (below, float(f"{high:.9g}") if high < last else None)
-        regions.append(Region(limits, float(held.mean())))
+        regions.append(TrustedRegion(limits, float(held.mean())))
         left &= ~held
     return tuple(sorted(regions, key=lambda region: -region.share))
 

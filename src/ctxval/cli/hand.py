@@ -17,7 +17,7 @@ from ctxval.campaign.choices import Execution
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.campaign.telling import SuppliedResult
 from ctxval.cli.base import Allowed, command, named_values, out, print_verdict, require_folder, status_of
-from ctxval.cli.config.settings import Settings
+from ctxval.cli.config.settings import ExperimentSettings
 from ctxval.cli.config.stored_settings import Opened, budget_of, limit_of, open_store, open_target, trusted_settings
 from ctxval.core.exchange import TASK_FORMAT
 from ctxval.core.trial import CONVERGED, Trial
@@ -219,7 +219,7 @@ def serve(
     web.serve(lambda: _served(open_store(store, allowed), threshold, budget), again, say_started, **where)
 
 
-def _reopened(settings: Settings, path: Path, threshold: float | None, budget: int | None) -> ServedCampaign:
+def _reopened(settings: ExperimentSettings, path: Path, threshold: float | None, budget: int | None) -> ServedCampaign:
     """Open a store by settings that the user has allowed to run here: those in it may have been changed since."""
     experiment = settings.load()
     campaign = settings.campaign(experiment, Store.existing(path))

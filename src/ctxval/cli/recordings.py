@@ -14,7 +14,7 @@ from ctxval.cli import base
 from ctxval.cli.base import command, err, named_values, notes, out, print_columns, require_outputs
 from ctxval.cli.config.parts import part
 from ctxval.cli.config.references import reference, require_function
-from ctxval.cli.config.settings import Settings, read_settings
+from ctxval.cli.config.settings import ExperimentSettings, read_settings
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of, names_of
 from ctxval.core.model import Model, as_model
@@ -72,7 +72,7 @@ class Logs:
         return {name: value for name, value in stated.items() if value is not None}
 
     def read(
-        self, logs: Sequence[Path], settings: Settings | None = None, experiment: Experiment | None = None
+        self, logs: Sequence[Path], settings: ExperimentSettings | None = None, experiment: Experiment | None = None
     ) -> Recordings:
         """Return the recordings in files and folders, with the names and units of the experiment if they fit."""
         mapping = self.stated()

@@ -19,7 +19,7 @@ from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.cli import base
 from ctxval.cli.base import command, err, named_values, out, print_table
-from ctxval.cli.config.settings import Settings, read_settings
+from ctxval.cli.config.settings import ExperimentSettings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of
 from ctxval.cli.stores import print_envelope
 from ctxval.core.trajectory import Transitions
@@ -188,7 +188,7 @@ def _workers(workers: int | None, dask: str | None) -> Iterator[dict[str, Any]]:
 
 
 @contextmanager
-def _live_page(wanted: bool, served: ServedCampaign, settings: Settings) -> Iterator[LiveCampaign | None]:
+def _live_page(wanted: bool, served: ServedCampaign, settings: ExperimentSettings) -> Iterator[LiveCampaign | None]:
     if not wanted:
         yield None
         return

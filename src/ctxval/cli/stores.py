@@ -20,7 +20,7 @@ from ctxval.certificates import KINDS, CertificateOptions, assess
 from ctxval.certificates.envelope import Envelope
 from ctxval.cli import base
 from ctxval.cli.base import Allowed, command, named_values, out, print_table
-from ctxval.cli.config.settings import Settings
+from ctxval.cli.config.settings import ExperimentSettings
 from ctxval.cli.config.stored_settings import budget_of, limit_of, open_store, planned_settings, trusted_settings
 from ctxval.core.labels import Labels, labels_of
 from ctxval.errors import CtxvalError, InputError, StoreAccessError, StoreError
@@ -121,7 +121,7 @@ class Asked:
     quantile: float | None = None
     option: list[str] | None = None
 
-    def options(self, settings: Settings, kind: str | None) -> CertificateOptions:
+    def options(self, settings: ExperimentSettings, kind: str | None) -> CertificateOptions:
         given = {name: getattr(self, name) for name in ("discard", "volume", "resolution", "tests", "quantile")}
         level = settings.confidence if self.confidence is None else self.confidence
         return settings.certificate.options(level, kind=kind, stated=named_values(self.option, **given))

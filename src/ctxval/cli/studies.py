@@ -19,7 +19,7 @@ from ctxval.certificates.options import CONFIDENCE
 from ctxval.cli import base
 from ctxval.cli.base import Allowed, command, err, named_values, notes, out, print_columns, print_table, require_outputs
 from ctxval.cli.config.references import reference, require_function
-from ctxval.cli.config.settings import Settings, read_settings
+from ctxval.cli.config.settings import ExperimentSettings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of, open_target
 from ctxval.cli.recordings import StepFunction, print_parameters, require_model_file
 from ctxval.errors import CtxvalError, InputError
@@ -79,7 +79,7 @@ def compare(
 
 def _candidates(texts: Sequence[str], folder: Path, seed: int, options: dict[str, Any]) -> dict[str, Campaign]:
     """Return the campaigns of the candidates. A refused comparison leaves no store that a later one would find."""
-    settings: dict[str, Settings] = {}
+    settings: dict[str, ExperimentSettings] = {}
     for text in texts:
         before, equals, after = text.partition("=")
         named = bool(equals) and before.isidentifier()
@@ -257,7 +257,7 @@ def safe(
     return {**summary, "store": str(path)}, base.FALSIFIED if report.answer == "falsified" else 0
 
 
-def _has_another_margin(path: Path, settings: Settings) -> bool:
+def _has_another_margin(path: Path, settings: ExperimentSettings) -> bool:
     """Return whether a store was made for another margin, so that its distances are computed again."""
     kept = None
     with suppress(CtxvalError):  # the campaign says it

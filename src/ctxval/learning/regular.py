@@ -6,7 +6,7 @@ others are irregular: a least-squares fit of quadratic functions whose weights f
 1977) finds them first, and then a Gaussian process of the regular ones, in a few rounds.
 
 A run is regular until it comes to states like those of irregular transitions. Which states these are is unknown, so
-every simple explanation counts: a quadratic function of one or two states that separates the irregular transitions from
+every simple discriminant counts: a quadratic function of one or two states that separates the irregular transitions from
 the regular ones, and one of all states and inputs. It has the largest margin (a support vector machine with squared
 errors). A run is trusted if it comes no nearer to the irregular side of any of these functions than a regular record.
 """
@@ -36,7 +36,7 @@ _IRREGULAR = 5.0  # standardised error of the regular part from which a transiti
 _SHARE = 0.01  # error that is regular in any case, as a share of a state's regular residual
 _ROUNDS = 4
 _MOST = 0.3  # largest share of the executed transitions that may be irregular
-_OVERLAP = 0.01  # share of the regular states that an explanation may have on the irregular side
+_OVERLAP = 0.01  # share of the regular states that a discriminant may have on the irregular side
 _RIDGE = 1e-3
 
 
@@ -121,7 +121,7 @@ def _is_regular(posterior: DynamicsPosterior, transitions: Transitions, regular:
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
+class Discriminant:
     """A quadratic function of some coordinates that is larger at irregular transitions than at regular ones."""
 
     columns: tuple[int, ...]  # indices of standardised coordinates; states come before inputs
@@ -139,7 +139,7 @@ class Explanation:
 class Boundary:
     """Where the regular part of the dynamics ends, in standardised state-input pairs of its posterior."""
 
-    explanations: tuple[Explanation, ...]
+    discriminants: tuple[Discriminant, ...]
 
     @classmethod
     def between(cls, posterior: DynamicsPosterior, irregular: Transitions) -> Boundary:
@@ -155,13 +155,13 @@ class Boundary:
         # A step that hits something may begin before it, and leaves it as if nothing were there.
         ends = np.stack([others[:, :n], data.standardised(expected, irregular.u)[:, :n]])
         ends = np.where(np.isfinite(ends).all(axis=2, keepdims=True), ends, ends[:1])
-        explanations = []
+        discriminants = []
         for columns in [*combinations(range(n), 1), *combinations(range(n), 2)]:
-            explanation, overlap = _separated(regular[:, columns], ends[..., columns], columns)
+            discriminant, overlap = _separated(regular[:, columns], ends[..., columns], columns)
             if overlap <= _OVERLAP:
-                explanations.append(explanation)
+                discriminants.append(discriminant)
         every = tuple(range(pairs.shape[1]))
-        return cls((*explanations, _separated(pairs, others[None], every)[0]))
+        return cls((*discriminants, _separated(pairs, others[None], every)[0]))
 
     def crossed(self, posterior: DynamicsPosterior, loops: Loops) -> Array:
         """Return by how much loops of the first draw cross it ``(q,)``; at most 0 if not, 1 if one diverges."""
@@ -169,11 +169,11 @@ class Boundary:
         with np.errstate(all="ignore"):
             inputs = np.concatenate([inputs, inputs[:, -1:]], axis=1)
             pairs = np.nan_to_num(posterior.data.standardised(states, inputs), nan=1e3, posinf=1e3, neginf=-1e3)
-            excesses = [each.excess(np.clip(pairs, -1e3, 1e3)).max(axis=1) for each in self.explanations]
+            excesses = [each.excess(np.clip(pairs, -1e3, 1e3)).max(axis=1) for each in self.discriminants]
         return np.asarray(np.clip(np.max(excesses, axis=0), -1.0, 1.0) if excesses else np.full(len(states), -1.0))
 
 
-def _separated(regular: Array, ends: Array, columns: Sequence[int]) -> tuple[Explanation, float]:
+def _separated(regular: Array, ends: Array, columns: Sequence[int]) -> tuple[Discriminant, float]:
     """Return a function that separates points ``(N, k)`` from ends ``(e, M, k)``, and the share of points beyond."""
     F, of_ends = _quadratic(regular), _quadratic(ends.reshape(-1, ends.shape[-1])).reshape(*ends.shape[:2], -1)
     chosen, M = np.full(ends.shape[1], len(ends) - 1), ends.shape[1]
@@ -186,7 +186,7 @@ def _separated(regular: Array, ends: Array, columns: Sequence[int]) -> tuple[Exp
         chosen = again
     values, first = F @ weights, float((of_ends @ weights).max(axis=0).min())
     limit, width = min(float(values.max()), first), max(float(np.ptp(values)), 1e-9)
-    return Explanation(tuple(columns), weights, limit, width), float((values > first).mean())
+    return Discriminant(tuple(columns), weights, limit, width), float((values > first).mean())
 
 
 def _largest_margin(low: Array, high: Array) -> Array:

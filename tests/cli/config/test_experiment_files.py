@@ -23,7 +23,7 @@ from ctxval import Experiment, Store, Task, TaskSpace, Trajectory, Validation, c
 from ctxval.cli import app
 from ctxval.cli.config.check import check_experiment
 from ctxval.cli.config.parts import TaskTable, part, recorded
-from ctxval.cli.config.settings import Settings, read_settings
+from ctxval.cli.config.settings import ExperimentSettings, read_settings
 from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import CtxvalError, InputError
 from ctxval.testing import FaultyRig
@@ -283,7 +283,7 @@ def test_no_text_gives_anything_but_an_error_of_ours(text: str) -> None:
     except tomllib.TOMLDecodeError:
         return
     with pytest.raises((CtxvalError, ValueError)):
-        Settings.model_validate({**content, "unknown": 1})
+        ExperimentSettings.model_validate({**content, "unknown": 1})
 
 
 PLAIN = st.recursive(
@@ -310,7 +310,7 @@ def test_no_value_anywhere_gives_anything_but_an_error_of_ours(data: st.DataObje
     value = data.draw(PLAIN)
     content = {**WHOLE, table: value if key is None else {**WHOLE[table], key: value}}
     try:
-        settings = Settings.model_validate(content)
+        settings = ExperimentSettings.model_validate(content)
     except ValueError:
         return
     try:
@@ -573,7 +573,7 @@ def test_a_wrong_option_is_refused_before_an_execution_is_spent(table: str, entr
         return x + u
 
     def run() -> None:
-        settings = Settings.model_validate({**WHOLE, table: entry, "budget": 5, "threshold": 1.0})
+        settings = ExperimentSettings.model_validate({**WHOLE, table: entry, "budget": 5, "threshold": 1.0})
         experiment = settings.load()
         chosen = settings.certificate_options
         chosen.kind.require_usable(chosen.confidence, 5)
@@ -587,7 +587,7 @@ def test_a_wrong_option_is_refused_before_an_execution_is_spent(table: str, entr
 
 def test_a_file_names_the_states_that_are_compared() -> None:
     entry = {"type": "FinalState", "components": ["x"], "angles": ["x"]}
-    experiment = Settings.model_validate({**WHOLE, "distance": entry}).load()
+    experiment = ExperimentSettings.model_validate({**WHOLE, "distance": entry}).load()
     assert experiment.validation.distance == distances.FinalState(components=(0,), angles=(0,))
 
 

@@ -15,7 +15,7 @@ from ctxval import Experiment, TaskSpace, distances, models, systems
 from ctxval.cli import app
 from ctxval.cli.config.parts import argument, part, recorded, task_function
 from ctxval.cli.config.references import is_function, reference
-from ctxval.cli.config.settings import Settings, read_settings
+from ctxval.cli.config.settings import ExperimentSettings, read_settings
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError
 
@@ -212,10 +212,10 @@ def test_an_experiment_by_name_is_one_or_a_function_of_a_seed() -> None:
         ("experiment", "parts_here:experiment cannot be made: ZeroDivisionError: inside"),
     ):
         with pytest.raises(InputError) as refused:
-            Settings(experiment=f"parts_here:{name}").load()
+            ExperimentSettings(experiment=f"parts_here:{name}").load()
         assert sentence in str(refused.value)
     with pytest.raises(InputError, match=r"with a seed and its options length; it takes \(seed, size=1\)"):
-        Settings(experiment="parts_here:experiment", options={"length": 2}).load()
+        ExperimentSettings(experiment="parts_here:experiment", options={"length": 2}).load()
     assert calls() == []
 
 

@@ -102,9 +102,9 @@ def plain_store(path: str = "a.sqlite") -> Store:
 
 
 def read_settings_of(content: dict[str, Any]) -> Any:
-    from ctxval.cli.config.settings import Settings
+    from ctxval.cli.config.settings import ExperimentSettings
 
-    return Settings.model_validate(content)
+    return ExperimentSettings.model_validate(content)
 
 
 def store_with(settings: dict[str, Any], path: str = "a.sqlite") -> Store:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from ctxval.cli.config.settings import Settings
+from ctxval.cli.config.settings import ExperimentSettings
 from ctxval.cli.config.signatures import code_named
 from ctxval.distances import MaximumDeviation, UnsafeMargin
 from ctxval.errors import InputError
@@ -13,7 +13,7 @@ SPEC = {"avoid": {"type": "Ball", "center": [1.0], "radius": 0.2}, "components":
 
 
 def test_a_named_experiment_may_be_judged_by_a_specification() -> None:
-    settings = Settings.model_validate(
+    settings = ExperimentSettings.model_validate(
         {"experiment": "pendulum", "spec": {**SPEC, "margin": 0.1}, "judge": "spec", "threshold": 0.1}
     )
     experiment = settings.load()
@@ -29,11 +29,13 @@ def test_a_specification_names_no_code() -> None:
 
 def test_a_specification_that_is_missing_is_asked_for() -> None:
     with pytest.raises(InputError, match=r"the experiment file has no table \[spec\]"):
-        Settings.model_validate({"experiment": "pendulum", "judge": "spec"}).load()
+        ExperimentSettings.model_validate({"experiment": "pendulum", "judge": "spec"}).load()
 
 
 def test_the_margin_is_the_threshold() -> None:
-    settings = Settings.model_validate({"experiment": "pendulum", "spec": SPEC, "judge": "spec", "threshold": 0.5})
+    settings = ExperimentSettings.model_validate(
+        {"experiment": "pendulum", "spec": SPEC, "judge": "spec", "threshold": 0.5}
+    )
     with pytest.raises(InputError, match=r"its margin is the threshold, got 0\.5"):
         settings.load()
 
@@ -52,6 +54,6 @@ def test_with_a_specification_the_default_distance_is_the_deviation_of_its_state
         "synthesizer": {"type": "LQR", "Q": [1.0, 1.0], "R": [1.0]},
         "states": {"angle": "rad", "rate": "rad/s"},
     }
-    distance = Settings.model_validate({**described, "spec": SPEC}).load().validation.distance
+    distance = ExperimentSettings.model_validate({**described, "spec": SPEC}).load().validation.distance
     assert isinstance(distance, MaximumDeviation)
     assert distance.components == (0,)

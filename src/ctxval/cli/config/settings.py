@@ -110,7 +110,7 @@ class SpecTable(BaseModel, extra="allow"):
 _WHOLE = ("space", "task", "system", "model", "synthesizer")
 
 
-class Settings(BaseModel, extra="forbid"):
+class ExperimentSettings(BaseModel, extra="forbid"):
     """The content of an experiment file, overridden by the options of the command line."""
 
     experiment: str | None = None  #: names the experiment; otherwise ``name`` to ``units`` describe it completely
@@ -229,7 +229,7 @@ class Settings(BaseModel, extra="forbid"):
         campaign.store.keep_settings(signed(plain, campaign.store.settings()))
         return campaign
 
-    def certified_as(self, stated: dict[str, Any]) -> Settings:
+    def certified_as(self, stated: dict[str, Any]) -> ExperimentSettings:
         """Return these settings with options of the certificate from the command line, which override the file."""
         given = {name: value for name, value in stated.items() if value is not None}
         try:
@@ -264,7 +264,7 @@ class Settings(BaseModel, extra="forbid"):
         return Path("runs") / f"{names}-seed{self.seed}.sqlite"
 
 
-def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
+def read_settings(target: str, overrides: dict[str, Any]) -> ExperimentSettings:
     """Return the settings of a case, an experiment file or ``module:attr``."""
     is_file = target.endswith(".toml")
     if not is_file and ":" not in target and Path(target).suffix:
@@ -291,7 +291,7 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
     elif ":" in target:
         whole["folder"] = Path().resolve()
     try:
-        return Settings.model_validate(whole)
+        return ExperimentSettings.model_validate(whole)
     except ValidationError as error:
         field = str(next(iter(error.errors()[0]["loc"]), ""))
         raise InputError(sentence_of("" if given.get(field) is not None else f"{target}: ", error)) from error
@@ -323,7 +323,7 @@ def sentence_of(source: str, error: ValidationError) -> str:
     if first["type"] == "use":
         return f"{source}{first['msg']}"
     if first["type"] == "extra_forbidden":
-        return f"{source}{UnknownNameError.among('setting', str(first['loc'][-1]), Settings.model_fields)}"
+        return f"{source}{UnknownNameError.among('setting', str(first['loc'][-1]), ExperimentSettings.model_fields)}"
     name, value = ".".join(map(str, first["loc"])), first["input"]
     shown = repr(value[:100]) if isinstance(value, str) else str(value)[:100]
     match first:

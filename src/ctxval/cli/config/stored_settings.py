@@ -18,16 +18,16 @@ from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.certificates import KINDS
 from ctxval.cli.base import Allowed, err
 from ctxval.cli.config.parts import REGISTRIES
-from ctxval.cli.config.settings import Settings, not_an_experiment, read_settings, sentence_of
+from ctxval.cli.config.settings import ExperimentSettings, not_an_experiment, read_settings, sentence_of
 from ctxval.cli.config.signatures import code_named, unsigned, verifies, why_no_key
 from ctxval.errors import InputError
 
 
-def planned_settings(store: Store, kind: str | None = None) -> Settings:
+def planned_settings(store: Store, kind: str | None = None) -> ExperimentSettings:
     """Return the settings in a store, whoever wrote them, from which nothing may be built; the defaults if none."""
     kept = store.settings()
     if not kept:
-        return Settings()
+        return ExperimentSettings()
     settings = _of_store(kept)
     planned = settings.certificate.kind
     if kind is None and not KINDS.is_data(planned) and not verifies(kept):
@@ -37,17 +37,17 @@ def planned_settings(store: Store, kind: str | None = None) -> Settings:
     return settings
 
 
-def _of_store(kept: dict[str, Any]) -> Settings:
+def _of_store(kept: dict[str, Any]) -> ExperimentSettings:
     if not kept:
         why = "the store does not name its experiment, because it was not made by a command"
         raise InputError(f"{why}: name the experiment with --experiment FILE.toml.")
     try:
-        return Settings.model_validate(unsigned(kept))
+        return ExperimentSettings.model_validate(unsigned(kept))
     except ValidationError as error:
         raise InputError(sentence_of("the store's settings: ", error)) from error
 
 
-def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool = False) -> Settings:
+def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool = False) -> ExperimentSettings:
     """Return the settings from which a store's experiment may be built."""
     kept = store.settings()
     if experiment is not None and trust:
@@ -114,19 +114,19 @@ def _texts(value: Any, path: bool) -> Iterator[str]:
 class Opened:
     """A store, with its settings, its experiment and its campaign."""
 
-    settings: Settings
+    settings: ExperimentSettings
     experiment: Experiment
     campaign: Campaign
     path: Path
 
 
-def limit_of(experiment: Experiment, settings: Settings, given: float | None = None) -> float | None:
+def limit_of(experiment: Experiment, settings: ExperimentSettings, given: float | None = None) -> float | None:
     """Return the threshold of the verdict: the given one, or else that of the settings, or else of the experiment."""
     known = (value for value in (given, settings.threshold, experiment.threshold) if value is not None)
     return require("threshold", PositiveFloat | None, next(known, None))  # type: ignore[no-any-return]
 
 
-def budget_of(experiment: Experiment, settings: Settings, given: int | None = None) -> int:
+def budget_of(experiment: Experiment, settings: ExperimentSettings, given: int | None = None) -> int:
     """Return the budget: the given one, or else that of the settings, or else of the experiment."""
     known = (value for value in (given, settings.budget, experiment.budget) if value is not None)
     return require("budget", PositiveInt, next(known))  # type: ignore[no-any-return]

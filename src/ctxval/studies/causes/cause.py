@@ -194,7 +194,7 @@ class Cause(ShortRepr):
 
 
 @dataclass(frozen=True)
-class Candidate(ShortRepr):
+class CauseCandidate(ShortRepr):
     """A cause whose sizes are to be fitted."""
 
     cause: Cause
@@ -204,12 +204,12 @@ class Candidate(ShortRepr):
     starts: tuple[tuple[float, ...], ...] = ((),)  #: first guesses, of which the best one is refined
 
 
-def of_size(cause: Cause, low: float, high: float, scale: float, *starts: float) -> Candidate:
+def of_size(cause: Cause, low: float, high: float, scale: float, *starts: float) -> CauseCandidate:
     """Return a candidate with one size."""
-    return Candidate(cause, (low,), (high,), (scale,), tuple((start,) for start in starts))
+    return CauseCandidate(cause, (low,), (high,), (scale,), tuple((start,) for start in starts))
 
 
-def of_ratio(cause: Cause) -> Candidate:
+def of_ratio(cause: Cause) -> CauseCandidate:
     """Return a candidate whose size is a ratio."""
     return of_size(cause, 0.1, 10.0, 0.1, 0.95, 1.1)
 

@@ -12,7 +12,7 @@ from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
-from ctxval.studies.causes.cause import Candidate, Repaired
+from ctxval.studies.causes.cause import CauseCandidate, Repaired
 
 STEPS = (1, 6)  # of the predictions
 _LARGEST = 1e3  # of a residual, as a multiple of the typical one of M
@@ -154,7 +154,7 @@ class Evidence:
 class Explanation(ShortRepr):
     """Causes with fitted sizes, and how well they explain the records."""
 
-    candidates: tuple[Candidate, ...]  #: those that were fitted, with the causes of ``repaired``
+    candidates: tuple[CauseCandidate, ...]  #: those that were fitted, with the causes of ``repaired``
     repaired: Repaired
     criterion: float  #: the Bayesian information criterion; the smaller, the better
     left: float  #: the share of the squared residuals of M that is left
@@ -166,7 +166,7 @@ class Explanation(ShortRepr):
 
 
 def explained(
-    evidence: Evidence, candidates: tuple[Candidate, ...], begun: Sequence[float] | Array, *, near: bool = False
+    evidence: Evidence, candidates: tuple[CauseCandidate, ...], begun: Sequence[float] | Array, *, near: bool = False
 ) -> Explanation:
     """Return causes whose sizes are fitted to records by nonlinear least squares, from sizes that are ``begun`` with.
 
@@ -192,7 +192,7 @@ def explained(
     return Explanation(fitted, model, misfit + fit.penalty, left)
 
 
-def screened(evidence: Evidence, candidates: tuple[Candidate, ...]) -> tuple[float, Array]:
+def screened(evidence: Evidence, candidates: tuple[CauseCandidate, ...]) -> tuple[float, Array]:
     """Return how badly causes explain records at most, and sizes to begin a fit with.
 
     One Gauss-Newton step is made from each first guess of the last cause; residuals are taken as linear in the sizes.
@@ -215,7 +215,7 @@ def screened(evidence: Evidence, candidates: tuple[Candidate, ...]) -> tuple[flo
 class _Fit:
     """The residuals of records as a function of the sizes of causes."""
 
-    def __init__(self, evidence: Evidence, candidates: tuple[Candidate, ...]) -> None:
+    def __init__(self, evidence: Evidence, candidates: tuple[CauseCandidate, ...]) -> None:
         self.evidence, self.candidates = evidence, candidates
         self.low, self.high, self.scales = (
             np.array([value for each in candidates for value in getattr(each, name)])

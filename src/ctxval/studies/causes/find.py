@@ -22,7 +22,7 @@ from ctxval.errors import CtxvalError, DistanceError, InputError
 from ctxval.learning.extended import estimates_by_loops_on_model
 from ctxval.models import MuJoCo
 from ctxval.studies.causes import mechanics, signals
-from ctxval.studies.causes.cause import Candidate, Plant, Repaired, of_size, plant_of
+from ctxval.studies.causes.cause import CauseCandidate, Plant, Repaired, of_size, plant_of
 from ctxval.studies.causes.evidence import STEPS, Evidence, Explanation, explained, screened
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
 
@@ -261,7 +261,7 @@ class _Study:
                 return Explanation((replace(each, cause=repaired.causes[0]),), repaired, 0.0, 1.0)
         return None
 
-    def _ranked(self, beside: tuple[Candidate, ...]) -> list[Explanation]:
+    def _ranked(self, beside: tuple[CauseCandidate, ...]) -> list[Explanation]:
         """Return explanations by each cause beside given ones, the most probable first; the best of a screening."""
         kinds = [each.cause.with_sizes(()) for each in beside]
         results = []
@@ -345,7 +345,7 @@ class _Study:
         return best
 
 
-def candidates(plant: Plant, x: Array, u: Array, residuals: Array, *, outputs: bool) -> tuple[Candidate, ...]:
+def candidates(plant: Plant, x: Array, u: Array, residuals: Array, *, outputs: bool) -> tuple[CauseCandidate, ...]:
     """Return the dictionary of a plant for recorded states and inputs, and what M misses of next states ``(N, n)``."""
     missed = np.sqrt([(column**2).mean() for column in residuals.T])
     return (

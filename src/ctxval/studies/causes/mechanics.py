@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.core.model import Model
-from ctxval.studies.causes.cause import Candidate, Cause, Joint, Plant, of_ratio, of_size
+from ctxval.studies.causes.cause import Cause, CauseCandidate, Joint, Plant, of_ratio, of_size
 
 
 @dataclass(frozen=True)
@@ -304,7 +304,7 @@ class MassCentre(OfMuJoCo):
         return f'<inertial pos="{" ".join(f"{value:.5g}" for value in place)}"/>'
 
 
-def forces(plant: Plant, joint: Joint, x: Array, u: Array, missed: Array) -> Iterator[Candidate]:
+def forces(plant: Plant, joint: Joint, x: Array, u: Array, missed: Array) -> Iterator[CauseCandidate]:
     """Yield the forces that may enter at a place, in sizes whose effects are as large as what M misses of its rate."""
     probe = 0.1 * float(plant.commanded[joint.input]) if joint.input is not None and joint.dof is None else 1.0
     rows = slice(None, None, max(1, len(x) // 50))
@@ -324,7 +324,7 @@ def forces(plant: Plant, joint: Joint, x: Array, u: Array, missed: Array) -> Ite
     if joint.dof is None:
         yield of_size(Viscous((0.0,), *where), -20 * slope, 20 * slope, 0.1 * slope, 0.0)
         yield of_size(Coulomb((0.0,), *where), 0.0, most, least, 0.3 * force, force)
-    yield Candidate(
+    yield CauseCandidate(
         Stribeck((0.0, 0.0, 1.0), *where),
         (0.0, 0.0, 0.01 * speed),
         (most, most, 2 * speed),
@@ -333,10 +333,10 @@ def forces(plant: Plant, joint: Joint, x: Array, u: Array, missed: Array) -> Ite
     )
     starts = ((0.05, 0.0), (0.2, 0.3 * force))
     rates = tuple(dict.fromkeys(port.rate for port in plant.ports if port.input is not None))
-    yield Candidate(LoadFriction((0.0, 0.0), *where, rates), (0.0, 0.0), (2.0, most), (0.05, least), starts)
+    yield CauseCandidate(LoadFriction((0.0, 0.0), *where, rates), (0.0, 0.0), (2.0, most), (0.05, least), starts)
 
 
-def of_joints(plant: Plant) -> Iterator[Candidate]:
+def of_joints(plant: Plant) -> Iterator[CauseCandidate]:
     """Yield what may be wrong with joints of a model that is not of MuJoCo."""
     # The joints have positions, all or none.
     rates = tuple(joint.rate for joint in plant.joints if joint.position is not None)
@@ -347,7 +347,7 @@ def of_joints(plant: Plant) -> Iterator[Candidate]:
             yield of_ratio(Gravity((1.0,), joints, rates, plant.dt))
 
 
-def of_mujoco(plant: Plant, missed: Array) -> Iterator[Candidate]:
+def of_mujoco(plant: Plant, missed: Array) -> Iterator[CauseCandidate]:
     """Yield what may be wrong with joints and bodies of a model of MuJoCo."""
     import mujoco
 

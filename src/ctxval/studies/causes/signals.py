@@ -11,7 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.learning.actuators import Actuator
-from ctxval.studies.causes.cause import Candidate, Cause, Plant, of_ratio, of_size
+from ctxval.studies.causes.cause import Cause, CauseCandidate, Plant, of_ratio, of_size
 
 
 def _at(values: Array, index: int | list[int] | None, size: float, elsewhere: float = 0.0) -> Array:
@@ -242,7 +242,7 @@ class SwappedJoints(Cause):
         return f"the sensors of {plant.states[self.first[0]][0]} and {plant.states[self.second[0]][0]} are exchanged"
 
 
-def of_inputs(plant: Plant) -> Iterator[Candidate]:
+def of_inputs(plant: Plant) -> Iterator[CauseCandidate]:
     """Yield what may be wrong with inputs."""
     m = len(plant.inputs)
     for k, most in enumerate(plant.commanded.tolist()):
@@ -252,16 +252,16 @@ def of_inputs(plant: Plant) -> Iterator[Candidate]:
         yield of_size(Saturation((most,), k), 1e-3 * most, most, 0.05 * most, *limits)
         for kind in (DeadZone, Backlash):
             yield of_size(kind((0.0,), k), 0.0, most, 0.02 * most, *(share * most for share in (0.01, 0.05, 0.15)))
-        yield Candidate(ReversedInput((), k))
+        yield CauseCandidate(ReversedInput((), k))
     if m > 1:
         yield of_ratio(InputGain((1.0,), None))
     for first, second in combinations(range(m), 2):
-        yield Candidate(SwappedInputs((), first, second))
+        yield CauseCandidate(SwappedInputs((), first, second))
     yield of_size(Delay((1.0,)), 0.0, 8.0, 0.2, 0.5, 1.5, 2.5, 4.0)
     yield of_size(Lag((1.0,)), 0.05, 10.0, 0.2, 0.5, 1.5, 4.0)
 
 
-def of_sensors(plant: Plant, x: Array) -> Iterator[Candidate]:
+def of_sensors(plant: Plant, x: Array) -> Iterator[CauseCandidate]:
     """Yield what may be wrong with sensors of recorded states ``(N, n)``."""
     ranges = np.ptp(x, axis=0)
     groups = [(joint.rate,) if joint.position is None else (joint.position, joint.rate) for joint in plant.joints]
@@ -272,4 +272,4 @@ def of_sensors(plant: Plant, x: Array) -> Iterator[Candidate]:
     moving = [group for group in groups if ranges[group[0]] > 0]
     pairs = [group for group in moving if len(group) == len(moving[0])]
     for first, second in combinations(pairs, 2):
-        yield Candidate(SwappedJoints((), first, second))
+        yield CauseCandidate(SwappedJoints((), first, second))

@@ -40,7 +40,7 @@ class StepError(ShortRepr):
 
 
 @dataclass(frozen=True)
-class Region(ShortRepr):
+class RegionalError(ShortRepr):
     """The one-step error in a range of one state or input, with so many recorded steps."""
 
     variable: str
@@ -171,7 +171,7 @@ def normalised(errors: Array, changes: Array) -> Array:
     return np.asarray(np.sqrt(((errors[:, moving] / sizes[moving]) ** 2).mean(axis=1)))
 
 
-def regions(model: Model, recordings: Recordings) -> tuple[Region, ...]:
+def regions(model: Model, recordings: Recordings) -> tuple[RegionalError, ...]:
     """Return the one-step error in five ranges of each state and input that have equally many steps."""
     where = Windows.of(recordings, 0, 1)
     error = normalised(*predicted(model, where, 1)) if len(where) else np.empty(0)
@@ -181,12 +181,14 @@ def regions(model: Model, recordings: Recordings) -> tuple[Region, ...]:
     overall = float(np.sqrt((error[known] ** 2).mean()))
     values = where.pairs()[known]
     labels = recordings.states | recordings.inputs
-    results: list[Region] = []
+    results: list[RegionalError] = []
     for (name, unit), column in zip(labels.items(), values.T, strict=True):
         edges = np.unique(np.quantile(column, np.linspace(0, 1, 6)))
         bins = np.clip(np.searchsorted(edges, column, side="right") - 1, 0, max(len(edges) - 2, 0))
         for k, (low, high) in enumerate(pairwise(edges.tolist())):
             inside = error[known][bins == k]
             rms = float(np.sqrt((inside**2).mean())) if len(inside) else 0.0
-            results.append(Region(name, unit, low, high, len(inside), rms, rms / overall if overall > 0 else 1.0))
+            results.append(
+                RegionalError(name, unit, low, high, len(inside), rms, rms / overall if overall > 0 else 1.0)
+            )
     return tuple(results)

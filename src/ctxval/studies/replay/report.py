@@ -23,7 +23,7 @@ from ctxval.errors import InputError
 from ctxval.learning import DynamicsStudy
 from ctxval.learning.closed_loops import loop_pairs
 from ctxval.studies.replay import causes
-from ctxval.studies.replay.accuracy import Region, StepError, regions, step_errors
+from ctxval.studies.replay.accuracy import RegionalError, StepError, regions, step_errors
 from ctxval.studies.replay.causes import Fault, ResidualShare, Suggestion
 
 STEPS = (1, 5, 20, 100)  #: numbers of steps after which errors are computed, unless others are given
@@ -144,7 +144,7 @@ class ReplayReport(ShortRepr):
 
     data: RecordedData
     errors: tuple[StepError, ...]  #: the error of each state after each number of steps
-    regions: tuple[Region, ...]  #: the one-step error in ranges of each state and input
+    regions: tuple[RegionalError, ...]  #: the one-step error in ranges of each state and input
     residuals: tuple[ResidualShare, ...]  #: how much of the one-step residual of each state can be explained
     suggestions: tuple[Suggestion, ...]  #: changes of timing, and faults of the recordings, that explain errors
     faults: tuple[Fault, ...]
