@@ -6,8 +6,8 @@ others are irregular: a least-squares fit of quadratic functions whose weights f
 1977) finds them first, and then a Gaussian process of the regular ones, in a few rounds.
 
 A run is regular until it comes to states like those of irregular transitions. Which states these are is unknown, so
-every simple discriminant counts: a quadratic function of one or two states that separates the irregular transitions from
-the regular ones, and one of all states and inputs. It has the largest margin (a support vector machine with squared
+every simple discriminant counts: a quadratic function of one or two states that separates the irregular transitions
+from the regular ones, and one of all states and inputs. It has the largest margin (a support vector machine with squared
 errors). A run is trusted if it comes no nearer to the irregular side of any of these functions than a regular record.
 """
 
