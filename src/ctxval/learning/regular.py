@@ -7,8 +7,9 @@ others are irregular: a least-squares fit of quadratic functions whose weights f
 
 A run is regular until it comes to states like those of irregular transitions. Which states these are is unknown, so
 every simple discriminant counts: a quadratic function of one or two states that separates the irregular transitions
-from the regular ones, and one of all states and inputs. It has the largest margin (a support vector machine with squared
-errors). A run is trusted if it comes no nearer to the irregular side of any of these functions than a regular record.
+from the regular ones, and one of all states and inputs. It has the largest margin (a support vector machine with
+squared errors). A run is trusted if it comes no nearer to the irregular side of any of these functions than a regular
+record.
 """
 
 from __future__ import annotations
