@@ -28,6 +28,7 @@ from ctxval.certificates.bounds import Quantities, with_units
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, bound_of, certify_dynamics
 from ctxval.certificates.dynamics_diagnostics import (
+    FAILING,
     FEWEST,
     doubt_of,
     held,
@@ -52,7 +53,6 @@ from ctxval.errors import CertificateError, InputError
 from ctxval.learning.worst_case import is_kinked
 
 _FAR = 10.0  # multiple of what is known or allowed from which a predicted distance is said to be dangerous
-_FAILING = 6  # of so many last predictions, at least half must hold
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,9 +292,9 @@ class IntervalSearch:
         """Return whether predictions fail so often that the dynamics cannot be learned."""
         if isinstance(self.options.kind, Dynamics):
             return False
-        last, bound = evidence.predictions[-_FAILING:], evidence.upper(self.options.confidence)
+        last, bound = evidence.predictions[-FAILING:], evidence.upper(self.options.confidence)
         tolerated = max(min(bound, self.limit), self.limit - bound)  # as far as the margin to the limit allows
-        return len(last) == _FAILING and 2 * sum(held(prediction, tolerated) for prediction in last) < _FAILING
+        return len(last) == FAILING and 2 * sum(held(prediction, tolerated) for prediction in last) < FAILING
 
     def _bound(self, evidence: DynamicsEvidence) -> float:
         return bound_of(evidence, self.best, self.options.confidence)

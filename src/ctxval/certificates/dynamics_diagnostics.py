@@ -20,6 +20,7 @@ from ctxval.core.coverage import StateInputGap
 # Limits; docs/theory.md has the reason for each.
 
 FEWEST = 3  # executions for a bound: the data that M was made from are no executions
+FAILING = 6  # of so many last predictions, at least half must hold; otherwise the dynamics cannot be learned
 PREDICTIONS = 3  # last predictions that must have held
 ACCURATE = 0.05
 """Largest difference between a distance and its prediction that held, as a share of the bound or, if a prediction
