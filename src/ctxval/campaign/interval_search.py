@@ -351,7 +351,7 @@ def with_next_task(verdict: Verdict, recorder: TrialRecorder, options: Certifica
     task, learned = with_units(space.labelled(point)), recorder.dynamics.learned(recorder.trials)
     far = _FAR * max(search.best, search.limit)
     if learned is not None and not learned.expected(choice.unit_point[None])[0] <= far:
-        task += " (its predicted run goes far beyond all others: be ready to stop it)"
+        task = f"(caution: its predicted run goes far beyond all others; be ready to stop it) {task}"
     reason = f"{verdict.reason.removesuffix('.')}; next task: {task}."
     return replace(verdict, reason=reason, next_task=space.describe_point(point))
 

@@ -99,7 +99,7 @@ class Automatic(CertificateKind):
         if doubt is None and missing:
             doubt = (
                 f"at least {missing} more {'task' if missing == 1 else 'tasks'} drawn over the whole task space must "
-                "be executed (`ctxval run` executes them; --tests 0 leaves them out)"
+                "be executed (`ctxval run` executes them)"
             )
         details = {**certificate.details, "tests": {**shown, "largest_error": None}}
         certificate = replace(certificate, details=details, doubt=doubt)

@@ -279,8 +279,8 @@ def conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
         complete,
         *([f"the inputs {acting} in every task, as in the executions"] if acting else []),
         alike,
-        "its dynamics having nothing new in the gaps of the records, which are in each coordinate alone at most "
-        f"{with_units(details['resolution'])}",
+        f"its dynamics having nothing new in the gaps of the records (at most {with_units(details['resolution'])} in "
+        "single coordinates, more in several at once)",
     ]
 
 

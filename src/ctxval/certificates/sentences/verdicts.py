@@ -172,8 +172,9 @@ def rests_on(
     draws = [f"{counted(tests['spread'], 'test')} drawn as a Latin hypercube"] if tests["spread"] else []
     draws += [counted(tests["independent"], "independent draw")] if tests["independent"] else []
     return (
-        f"{text} By these tests alone, whatever the dynamics are: at most {at_most(100 * tests['share_missed'], 2)} % "
-        f"{of_tasks(certificate.distribution)} exceed {known.quantities.of(f'{tau:.6g}')} "
+        f"{text} Without these assumptions, the tests alone show that at most "
+        f"{at_most(100 * tests['share_missed'], 2)} % {of_tasks(certificate.distribution)} exceed "
+        f"{known.quantities.of(f'{tau:.6g}')} "
         f"({' and '.join(draws)}, {percent(certificate.confidence)})."
     )
 
@@ -197,8 +198,9 @@ def _evidence(certificate: Certificate, tau: float, quantities: Quantities) -> s
     if (pushes := tolerances(certificate, tau)) is not None:
         everywhere, away = pushes
         text += (
-            f" The bound would survive a further error of M of {_push(everywhere)} at every step, or of {_push(away)} "
-            f"where no record is near; its largest recorded error is {_rate(everywhere.state, everywhere.residual)}."
+            f" The bound would survive a further error of M, beyond what was learned, of {_push(everywhere)} at every "
+            f"step, or of {_push(away)} where no record is near; the largest error that was recorded, and learned, is "
+            f"{_rate(everywhere.state, everywhere.residual)}."
         )
     if (pocket := details.get("pocket")) is not None:
         text += (

@@ -41,12 +41,12 @@ UNTRIED = (
     "one; an execution there helps (`ctxval run` executes it)"
 )
 UNTRIED_CORNER = (
-    "no execution has a task near the corner {place}, and what stands in a corner, such as a post or a wall, concerns "
-    "few tasks; an execution there helps (`ctxval run` executes it)"
+    "no execution has a task near the corner {place}, and what stands in a corner, such as a post or a wall, would go "
+    "unnoticed; an execution there helps (`ctxval run` executes it)"
 )
 POCKET = (
     "no execution came within {within} of {place}, where predicted runs lead, and a post, a hole or a current there "
-    "would concern few tasks; an execution that leads there helps (`ctxval run` executes it)"
+    "would go unnoticed; an execution that leads there helps (`ctxval run` executes it)"
 )
 NOT_TESTED = (
     "the largest distance is predicted to be {highest:.4g}, but the largest executed one is {best:.4g}: the prediction "
@@ -58,7 +58,7 @@ NONE_HELD = (
 )
 TESTS_MISSING = (
     "at least {missing} more {executions} must be predicted beforehand, at tasks drawn over the whole task space "
-    "(`ctxval run` executes them; --tests 0 leaves them out)"
+    "(`ctxval run` executes them)"
 )
 JUMPS = (
     "{what} if a task changes by a thousandth of its ranges, so a search may miss the largest distance: the "
@@ -82,7 +82,7 @@ SURPRISING = (
 FAR_TASK = (
     "some task is {farthest:.2g} of the task space's diagonal away from every trial, more than the resolution of "
     "{resolution:g}, so the bound is withdrawn; {many} more executions would come near to every task (`ctxval run` "
-    "makes them), or an audit bounds how many tasks are worse"
+    "makes them), or `ctxval certify --audit N` bounds the share of the tasks that exceed the threshold"
 )
 BARE_CORNERS = (
     "no trial is at or next to {bare} of the {corners} {where}, towards which the distance may rise unseen, so the "
