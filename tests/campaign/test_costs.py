@@ -77,6 +77,7 @@ def test_the_estimate_is_that_of_a_real_suggestion_within_a_factor() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_check_states_the_costs_without_an_execution() -> None:
     found = {one.check: one for one in check_experiment(Experiment("x", with_synthesizer(Busy(0.0))))}
     assert found["cost"].state == "ok"

@@ -57,6 +57,7 @@ def test_it_finds_the_true_set_after_a_falsification_and_includes_nothing_else(
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_failure_beyond_the_threshold_is_outside_or_contradicts_it(
     whole: Campaign, envelope: certificates.Envelope, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -197,6 +197,7 @@ def test_other_task_parameters_and_late_inputs_are_found_together() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("few_loops")
 def test_a_cart_that_obeys_late_is_validated_and_the_verdict_says_how_late() -> None:
     validation = cart(delay=1.3)
