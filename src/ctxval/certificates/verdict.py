@@ -88,7 +88,7 @@ def counterexample(
     if not above:
         return None
     worst = max(above, key=lambda trial: (trial.distance is not None, trial.least))
-    return Verdict("falsified", tau, sentences.falsified(worst, trials, tau, quantities, bets), worst)
+    return Verdict("falsified", tau, sentences.falsified(worst, trials, tau, quantities, bets, confidence), worst)
 
 
 @checked
@@ -146,7 +146,7 @@ def judge(
     parts = [verdict.reason.removesuffix("."), verdict.expected, designs_sentence(trials)]
     bets = bets_against(trials, float(threshold), quantile)
     if verdict.answer != "falsified" and bets is not None and bets.above:
-        parts.append(sentences.noise_may_explain(bets, float(threshold), known.quantities))
+        parts.append(sentences.noise_may_explain(bets, float(threshold), known.quantities, chosen.confidence))
     reason = "; ".join(str(part) for part in parts if part is not None)
     return replace(verdict, reason=f"{reason}.{sentences.caution(known, threshold)}")
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 def falsified(
-    worst: Trial, trials: Sequence[Trial], tau: float, quantities: Quantities, bets: Bets | None = None
+    worst: Trial, trials: Sequence[Trial], tau: float, quantities: Quantities, bets: Bets | None, confidence: float
 ) -> str:
     """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it."""
     distance, limit = distinguishable(worst.least, tau)
@@ -61,7 +61,8 @@ def falsified(
     if bets is not None:
         noise = (
             f"; {bets.above} of {counted(bets.executions, 'execution')} exceed it, too many for noise if "
-            f"{100 * bets.quantile:g} % of the executions of each task stay below it (e-value {bets.wealth:.3g})"
+            f"{100 * bets.quantile:g} % of the executions of each task stay below it (e-value {bets.wealth:.3g}, "
+            f"where {_needed(confidence)})"
         )
     return (
         f"trial {worst.number} has the distance {quantities.of(distance)}, which exceeds {quantities.of(limit)}, "
@@ -69,12 +70,17 @@ def falsified(
     )
 
 
-def noise_may_explain(bets: Bets, tau: float, quantities: Quantities) -> str:
+def _needed(confidence: float) -> str:
+    """Return which e-value rules noise out as the cause (Ville 1939)."""
+    return f"{1 / (1 - confidence):.3g} is needed"
+
+
+def noise_may_explain(bets: Bets, tau: float, quantities: Quantities, confidence: float) -> str:
     """Return that executions exceed a threshold, and that noise may be the cause."""
     exceed = "exceeds" if bets.above == 1 else "exceed"
     return (
         f"{bets.above} of {counted(bets.executions, 'execution')} {exceed} {quantities.of(f'{tau:.6g}')}, which noise "
-        f"may explain (e-value {bets.wealth:.3g} against the threshold)"
+        f"may explain (e-value {bets.wealth:.3g} against the threshold, where {_needed(confidence)})"
     )
 
 
