@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections import Counter
 from typing import Any
 
@@ -66,7 +67,8 @@ def of_regular() -> str:
     earlier = "" if rule == RULE else f" (by the earlier rule {rule} of campaigns; the present one is {RULE})"
     return (
         f" At 1.25 d*, {len(executions)} of {len(of_rule)} campaigns on systems for which the assumptions hold were "
-        f"validated, after {', '.join(map(str, executions))} executions{earlier}."
+        f"validated, after a median of {statistics.median(executions):g} executions ({executions[0]} to "
+        f"{executions[-1]}), and {sum(count <= 15 for count in executions)} of them within 15{earlier}."
     )
 
 
