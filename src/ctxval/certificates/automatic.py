@@ -70,7 +70,8 @@ class Automatic(CertificateKind):
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the first certificate that keeps the threshold, or else the one that is nearer to a decision.
 
-        Without a threshold, it is the dynamics bound or, if that is withdrawn or refused, the posterior bound.
+        Without a threshold, it is the dynamics bound or, if that is withdrawn or refused, the posterior bound. This is
+        not said to be nearer if more than 100 executions would come near to every task, and most predictions hold.
         """
         threshold = sample.threshold
         # A resolution of one's own asks for the posterior bound.
