@@ -65,10 +65,14 @@ def of_regular() -> str:
     of_rule = [line for line in lines if line["rule"] == rule]
     executions = sorted(line["executions"] for line in of_rule if line["answer"] == "validated")
     earlier = "" if rule == RULE else f" (by the earlier rule {rule} of campaigns; the present one is {RULE})"
+    after = ""
+    if executions:
+        soon = sum(count <= 15 for count in executions)
+        middle, spread = statistics.median(executions), f"{executions[0]} to {executions[-1]}"
+        after = f", after a median of {middle:g} executions ({spread}), and {soon} of them within 15"
     return (
         f" At 1.25 d*, {len(executions)} of {len(of_rule)} campaigns on systems for which the assumptions hold were "
-        f"validated, after a median of {statistics.median(executions):g} executions ({executions[0]} to "
-        f"{executions[-1]}), and {sum(count <= 15 for count in executions)} of them within 15{earlier}."
+        f"validated{after}{earlier}."
     )
 
 

@@ -23,9 +23,7 @@ from typing import Any
 from landed import tree_of
 
 HERE = Path(__file__).resolve()
-TOLD, EXECUTIONS = "a recorded trajectory, until the next suggestion", 6
-JUDGED = "a threshold, until its sentence"
-MEASURED = "a task, until its distance"
+EXECUTIONS = 6
 
 
 def functions_of(action: Callable[[], object], package: Path) -> list[str]:
@@ -68,7 +66,11 @@ def walk() -> dict[str, list[str]]:
     campaign, other = (Campaign(experiment.validation, seed=1).run(EXECUTIONS) for _ in range(2))
     opened = campaign.ask()
     trajectory = experiment.validation.system.execute(opened.plan.controller, opened.plan.task)
-    ways = {TOLD: told, JUDGED: judged, MEASURED: measured}
+    ways = {
+        "a recorded trajectory, until the next suggestion": told,
+        "a threshold, until its sentence": judged,
+        "a task, until its distance": measured,
+    }
     return {name: functions_of(action, package) for name, action in ways.items()}
 
 
@@ -90,11 +92,11 @@ def main() -> None:
         walks.append(json.loads(output.stdout.splitlines()[-1]))
     print(f"| | {' | '.join([*options.revisions, 'now'])} |")
     print("|---" * (1 + len(walks)) + "|")
-    for name in (TOLD, JUDGED, MEASURED):
+    for name in walks[-1]:
         counts = (f"{len(each[name])} in {len({entry.partition(':')[0] for entry in each[name]})}" for each in walks)
         print(f"| {name}: functions, in files | {' | '.join(counts)} |")
     if options.list:
-        print(*(f"\n{name}\n" + "\n".join(walks[-1][name]) for name in (TOLD, JUDGED, MEASURED)), sep="\n")
+        print(*(f"\n{name}\n" + "\n".join(functions) for name, functions in walks[-1].items()), sep="\n")
 
 
 if __name__ == "__main__":

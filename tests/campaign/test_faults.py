@@ -30,6 +30,7 @@ from ctxval.campaign.storage.rows import Side
 from ctxval.cli import app
 from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAccessError, StoreError
 from rig_cli import SMALL
+from rig_thorough import more
 
 HERE = Path(__file__).parents[1]
 SEARCH = searches.Random
@@ -453,7 +454,8 @@ def test_lines_are_counted_with_the_blank_ones(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_a_system_prints_does_not_spoil_the_json(tmp_path: Path) -> None:
+@pytest.mark.parametrize("workers", [*more("1"), "2"])
+def test_what_a_system_prints_does_not_spoil_the_json(workers: str, tmp_path: Path) -> None:
     (tmp_path / "talking.py").write_text(
         "import os\nfrom conftest import make_validation\n\n"
         "class Talking:\n"
@@ -467,7 +469,7 @@ def test_what_a_system_prints_does_not_spoil_the_json(tmp_path: Path) -> None:
     done = subprocess.run(
         [
             *(*SMALL, "run", "talking:validation", "--search", "random"),
-            *("--budget", "2", "--store", "a.sqlite", "--workers", "2", "--no-report", "--json"),
+            *("--budget", "2", "--store", "a.sqlite", "--workers", workers, "--no-report", "--json"),
         ],
         capture_output=True,
         text=True,

@@ -206,7 +206,6 @@ def test_a_report_does_not_replace_a_store(invoke: Any, store: Path) -> None:
             assert kept.read_bytes() == before
 
 
-@pytest.mark.thorough
 def test_a_report_replaces_its_own_files_and_no_others(invoke: Any, store: Path) -> None:
     written = ("--out", "a.html", "--junit", "a.xml", "--markdown", "a.md")
     for _ in range(2):

@@ -139,7 +139,6 @@ def test_dynamics_that_depend_on_a_stated_parameter_are_validated_by_a_bound_tha
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 @pytest.mark.usefixtures("few_loops")
 def test_a_statement_that_leaves_out_the_parameter_is_not_validated_below_the_largest_distance() -> None:
     validation = loaded_cart(("goal",))

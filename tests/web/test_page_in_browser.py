@@ -135,8 +135,9 @@ def test_a_whole_campaign_by_hand_of_two_operators(browser: Any, folder: Path, a
 
 @pytest.mark.thorough
 def test_a_falsification_on_a_phone(browser: Any, folder: Path, address: str) -> None:
-    ctxval("tell", "a.sqlite", "0", "--distance", "3", folder=folder)
-    ctxval("ask", "a.sqlite", "--explore", folder=folder)
+    for number, distance in enumerate(("0.02", "0.03", "0.04", "0.03", "3")):
+        ctxval("tell", "a.sqlite", str(number), "--distance", distance, folder=folder)
+        ctxval("ask", "a.sqlite", "--explore", folder=folder)
     phone = Operator(browser, folder, address, viewport={"width": 400, "height": 800}, color_scheme="dark")
     phone.opened()
     phone.page.locator(".answer").get_by_text("falsified").wait_for(timeout=WAIT)

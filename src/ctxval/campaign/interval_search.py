@@ -28,12 +28,12 @@ from ctxval.certificates.bounds import Quantities, with_units
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, bound_of, certify_dynamics
 from ctxval.certificates.dynamics_diagnostics import (
-    FAILING,
     FEWEST,
     doubt_of,
     held,
     is_explained,
     missing_tests,
+    mostly_fail,
     only_a_failed_test,
     only_tests_missing,
     raised,
@@ -292,9 +292,9 @@ class IntervalSearch:
         """Return whether predictions fail so often that the dynamics cannot be learned."""
         if isinstance(self.options.kind, Dynamics):
             return False
-        last, bound = evidence.predictions[-FAILING:], evidence.upper(self.options.confidence)
+        bound = evidence.upper(self.options.confidence)
         tolerated = max(min(bound, self.limit), self.limit - bound)  # as far as the margin to the limit allows
-        return len(last) == FAILING and 2 * sum(held(prediction, tolerated) for prediction in last) < FAILING
+        return mostly_fail([held(prediction, tolerated) for prediction in evidence.predictions])
 
     def _bound(self, evidence: DynamicsEvidence) -> float:
         return bound_of(evidence, self.best, self.options.confidence)

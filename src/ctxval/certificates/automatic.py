@@ -14,7 +14,7 @@ from ctxval._util.representation import counted
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics
-from ctxval.certificates.dynamics_diagnostics import FAILING, FEWEST
+from ctxval.certificates.dynamics_diagnostics import FEWEST, mostly_fail
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample
@@ -70,8 +70,9 @@ class Automatic(CertificateKind):
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the first certificate that keeps the threshold, or else the one that is nearer to a decision.
 
-        Without a threshold, it is the dynamics bound or, if that is withdrawn or refused, the posterior bound. This is
-        not said to be nearer if more than 100 executions would come near to every task, and most predictions hold.
+        Without a threshold, it is the dynamics bound or, if that is withdrawn or refused, the posterior bound. If
+        neither decides, and more than 100 executions would come near to every task, it is the dynamics bound as long
+        as its predictions hold.
         """
         threshold = sample.threshold
         # A resolution of one's own asks for the posterior bound.
@@ -107,11 +108,11 @@ class Automatic(CertificateKind):
         if by_dynamics is None or _decides(certificate, threshold):
             return certificate
         supported = threshold is not None and supported_by(by_dynamics, threshold)
+        if _decides(by_dynamics, None) or supported:
+            return by_dynamics
         # Predictions that hold decide sooner than executions next to every task, if that takes more than 100.
-        last = [each["held"] for each in by_dynamics.details["checked"][-FAILING:]]
-        holds = len(last) < FAILING or 2 * sum(last) >= FAILING
-        learns = holds and covering(sample.points, self.resolution, 100) is None
-        if _decides(by_dynamics, None) or supported or learns:
+        holding = [each["held"] for each in by_dynamics.details["checked"]]
+        if not mostly_fail(holding) and covering(sample.points, self.resolution, 100) is None:
             return by_dynamics
         suspect = by_dynamics.details["suspect"]
         return replace(certificate, details={**certificate.details, "suspect": suspect})

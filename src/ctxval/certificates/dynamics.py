@@ -30,6 +30,7 @@ from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.prediction_tests import TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed, require_learned
 from ctxval.certificates.sentences import statements
+from ctxval.certificates.sentences.withdrawals import AUDIT
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError
@@ -69,7 +70,7 @@ class Dynamics(CertificateKind):
         if not sample.best > 0:
             raise CertificateError(
                 "all distances are 0, so no prediction of a distance was tested. Check that the distance compares what "
-                "differs; an audit bounds how many tasks are worse."
+                f"differs; {AUDIT}."
             )
         evidence = learned.dynamics(confidence, self.quantile)
         if evidence is None:

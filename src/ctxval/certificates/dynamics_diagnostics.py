@@ -20,7 +20,7 @@ from ctxval.core.coverage import StateInputGap
 # Limits; docs/theory.md has the reason for each.
 
 FEWEST = 3  # executions for a bound: the data that M was made from are no executions
-FAILING = 6  # of so many last predictions, at least half must hold; otherwise the dynamics cannot be learned
+_FAILING = 6  # of so many last predictions, at least half must hold; otherwise the dynamics cannot be learned
 PREDICTIONS = 3  # last predictions that must have held
 ACCURATE = 0.05
 """Largest difference between a distance and its prediction that held, as a share of the bound or, if a prediction
@@ -68,6 +68,12 @@ def held(prediction: CheckedPrediction, bound: float) -> bool:
     if prediction.is_noisy:
         return prediction.chance_of_more(prediction.distance - TOLERATED * bound) >= UNLIKELY
     return agrees(prediction.distance, prediction.median, bound)
+
+
+def mostly_fail(holding: Sequence[bool]) -> bool:
+    """Return whether predictions fail so often that the dynamics cannot be learned, by which of all of them held."""
+    last = holding[-_FAILING:]
+    return len(last) == _FAILING and 2 * sum(last) < _FAILING
 
 
 def counted(evidence: DynamicsEvidence, bound: float) -> list[CheckedPrediction]:

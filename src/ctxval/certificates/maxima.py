@@ -16,6 +16,7 @@ from ctxval._util.progress import advance, stage
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import ERRORS, rank_within
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
+from ctxval.certificates.sentences.withdrawals import AUDIT
 from ctxval.errors import CertificateError
 from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters, draw_paths, maxima
 from ctxval.gp.surrogate import kept_rows
@@ -148,7 +149,7 @@ def _require_bounding(sample: Sample) -> None:
     if spread == 0:
         raise CertificateError(
             f"all {len(sample)} distances are {sample.distances[0]:g}: they do not bound d*. Check that the distance "
-            "compares what differs; an audit bounds how many tasks are worse."
+            f"compares what differs; {AUDIT}."
         )
     if spread < 1e-14 * largest:
         raise CertificateError(f"the distances differ from {largest:g} by rounding alone: they do not bound d*.")

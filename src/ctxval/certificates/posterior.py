@@ -57,7 +57,7 @@ class Posterior(CertificateKind):
             raise CertificateError(
                 f"some task is {farthest:.2g} of the task space's diagonal away from each of {len(sample)} trials, "
                 f"more than the resolution of {self.resolution:g}, so the bound would be withdrawn and is not "
-                "computed; an audit bounds how many tasks are worse."
+                f"computed; {withdrawals.AUDIT}."
             )
         drawn = draw_maxima(sample) if threshold is None else settle_maxima(sample, threshold, confidence)
         certificate = self.certify_drawn(sample, drawn, confidence)

@@ -159,9 +159,10 @@ def run(
     shown_keys = ("worst", "truth", "error_percent", "store", "report")
     rows |= {key: report[key] for key in shown_keys if key in report}
     if verdict is not None and verdict.answer == "falsified":
-        command = shlex.join(["ctxval", "why", str(path)])
-        holds = "" if envelope else "the same command with --envelope finds where M holds, "
-        rows["next"] = f"`{command}` tells what M lacks, {holds}and `ctxval refine` learns a better model"
+        advice = [f"`{shlex.join(['ctxval', 'why', str(path)])}` tells what M lacks"]
+        if not envelope and campaign.recorder.search.uses_prediction:
+            advice.append("the same command with --envelope finds where M holds")
+        rows["next"] = "; ".join([*advice, "`ctxval refine` learns a better model"])
     print_table(rows, units)
     if verdict is not None:
         base.print_other_stores(report["other_stores"])

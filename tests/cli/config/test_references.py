@@ -205,7 +205,10 @@ def test_functions_that_are_arguments_are_looked_at_too() -> None:
 
 def test_an_experiment_by_name_is_one_or_a_function_of_a_seed() -> None:
     for name, sentence in (
-        ("calls", "or a function that makes one, of a seed if it needs one, got list"),
+        (
+            "calls",
+            "must be an Experiment or a Validation, or a function that makes one, of a seed if it needs one, got list",
+        ),
         ("Rig", "must be an Experiment or a Validation"),
         ("builtin", "must be an Experiment or a Validation"),
         ("steps", "must be callable with a seed and its options; it takes (x, u, t)"),

@@ -3,6 +3,8 @@
 Those of a withdrawal say what is wrong and what would help.
 """
 
+AUDIT = "`ctxval certify --audit N` bounds the share of the tasks that exceed a threshold"
+
 # Learned dynamics
 
 FEW_EXECUTIONS = (
@@ -82,7 +84,7 @@ SURPRISING = (
 FAR_TASK = (
     "some task is {farthest:.2g} of the task space's diagonal away from every trial, more than the resolution of "
     "{resolution:g}, so the bound is withdrawn; {many} more executions would come near to every task (`ctxval run` "
-    "makes them), or `ctxval certify --audit N` bounds the share of the tasks that exceed the threshold"
+    f"makes them), or {AUDIT}"
 )
 BARE_CORNERS = (
     "no trial is at or next to {bare} of the {corners} {where}, towards which the distance may rise unseen, so the "
