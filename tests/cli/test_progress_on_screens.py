@@ -98,7 +98,6 @@ def at_terminal(folder: Path, *arguments: str, release_after: bytes | None = Non
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_a_run_shows_its_executions_and_what_it_is_doing(folder: Path) -> None:
     screen, out, status = at_terminal(
         folder, "run", "rig:experiment", "--explore", "--budget", "2", "--store", "a.sqlite", "--no-report"

@@ -136,7 +136,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_an_experiment_is_run_first_and_the_answer_is_said(whole: tuple[Result, Path]) -> None:
     done, folder = whole
     assert done.exit_code == 0, done.stdout + done.stderr

@@ -85,7 +85,6 @@ def invoke(folder: Path) -> Invoke:
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_it_finds_the_margin_and_other_commands_read_its_store(folder: Path, invoke: Invoke) -> None:
     found = report(invoke("safe", "wall.toml", "--audit", "12", "--json"))
     assert found["units"] == "m"
