@@ -90,7 +90,7 @@ they were decided, at thresholds of 1.1 and 0.9 times the largest distance of al
 0, and that is no smooth function of angle, rate and duty; so the learned dynamics predict other runs only roughly,
 and the campaign says so and goes on. Of {predictions} predictions that were stored before their run, {near} came
 within 20 % of the threshold of what was executed, and the median error is {error:.0f} % of the threshold. At 0.9
-d*, one execution decides.
+d*, the first run above the threshold decides.
 
 ## Which model is better
 

@@ -193,8 +193,8 @@ def test_no_page_has_the_name_of_one_that_the_manual_makes_itself() -> None:
 
 
 NEEDS = (
-    "A verdict in few executions needs dynamics that depend on the task through stated parameters at most; noise, late "
-    "commands and unrecorded states cost more executions and a wider bound"
+    "Few executions suffice if the dynamics depend on the task only through parameters that you state, or not at all. "
+    "Noise, late commands and unrecorded states need more executions and widen the bound"
 )
 
 

@@ -164,7 +164,7 @@ def test_tasks_that_touch_nothing_are_trusted_in_spite_of_a_wall() -> None:
     envelope = campaign.envelope(tau)
     assert envelope.doubt is None
     assert envelope.irregular > 0
-    assert "no smooth function of what is recorded, as contacts are" in envelope.statement
+    assert "not explained by a smooth function of state and input, as at a contact" in envelope.statement
     trusted = envelope.trusted(tasks)
     assert trusted[true <= tau].mean() > 0.8
     assert trusted[true > tau].mean() < 0.01

@@ -300,7 +300,7 @@ def test_a_validation_says_what_it_survives() -> None:
     evidence = replace(GOOD, pushed=PUSHED)
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(evidence)))
     assert verdict.answer == "validated"
-    assert "The bound would survive a further error of M" in str(verdict)
+    assert "No tried task exceeds the threshold under a further error of M" in str(verdict)
     assert "1.5 m/s^2 in speed" in str(verdict)
 
 

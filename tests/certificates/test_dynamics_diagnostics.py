@@ -51,7 +51,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"unplanned": 0.01}, "for 1 % of the tasks no controller can be designed"),
     ({"predictions": GOOD.predictions[:2]}, "2 executions of different tasks were predicted"),
     ({"noise": 2 * NOISE}, "2 % of the variance of the residual"),
-    ({"left_out": 1.1 * LEFT_OUT}, "leave out 55 % of the largest variance"),
+    ({"left_out": 1.1 * LEFT_OUT}, "lack 55 % of the largest posterior variance"),
     (
         {"coverage": replace(COVERED, beyond=gap(2 * BEYOND))},
         "leave the recorded range of u[0] by 4 % (at x[0] 1, u[0] 3)",

@@ -277,5 +277,7 @@ def test_tasks_whose_runs_come_to_contacts_are_not_trusted() -> None:
     assert found.to_json()["irregular"] == 7
     assert IRREGULAR in found.assumptions
     assert "leave what was recorded or come to contacts" in found.statement
-    assert "7 recorded steps are no smooth function of what is recorded, as contacts are" in found.statement
+    assert (
+        "7 recorded steps are not explained by a smooth function of state and input, as at a contact" in found.statement
+    )
     assert "come to contacts" not in usual_envelope().statement

@@ -13,8 +13,7 @@ def test_what_was_changed_in_a_store_is_remarked() -> None:
         Change("remeasured", "another norm", {"before": {}}),
     ]
     assert Provenance.of({}, changes).remarks == (
-        "what was changed after 7 trials makes no difference to them, as you state: 'gripper replaced' (x was 1 and is "
-        "now 2)",
+        "what was changed after 7 trials makes no difference to them: 'gripper replaced' (x was 1 and is now 2)",
         "the distances are those measured anew: 'another norm'",
     )
 

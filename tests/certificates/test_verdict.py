@@ -319,7 +319,7 @@ def test_a_failure_that_was_made_good_counts_no_more() -> None:
     explained = judge([*known, failed, replace(again, because="fuse replaced")], 1e3, by)
     assert explained.answer == "validated"
     assert explained.rests_on is not None
-    assert "your word that what made trial 8 fail is removed for good" in explained.rests_on
+    assert "your statement that the cause of the failure of trial 8 was removed permanently" in explained.rests_on
     assert made_good.certificate is not None
     assert never_failed.certificate is not None
     assert made_good.certificate.upper_bound == never_failed.certificate.upper_bound
@@ -431,7 +431,7 @@ def test_a_validation_rests_on_what_the_user_states() -> None:
     known = Provenance(remarks=("what was changed after 7 trials makes no difference to them", REFINED))
     verdict = judge(trials(), 50.0, posterior(), known)
     assert verdict.rests_on is not None
-    assert "your word that what was changed after 7 trials makes no difference to them" in verdict.rests_on
+    assert "your statement that what was changed after 7 trials makes no difference to them" in verdict.rests_on
     assert REFINED not in verdict.rests_on
 
 

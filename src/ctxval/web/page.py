@@ -137,7 +137,7 @@ class Page:
 
 _ORIGINS = {
     "iid": "The task is an independent random draw.",
-    "spread": "The task tests a prediction where nobody chose to look.",
+    "spread": "The task was drawn over the whole task space, to test a prediction.",
     "initial": "The task is one of the first tasks of the search, which are spread over the task space.",
     "acquisition": "The search expects to learn most about the largest distance from this task.",
     "covering": "The certificate that is to decide needs this task.",

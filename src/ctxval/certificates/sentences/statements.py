@@ -279,8 +279,8 @@ def conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
         complete,
         *([f"the inputs {acting} in every task, as in the executions"] if acting else []),
         alike,
-        f"its dynamics having nothing new in the gaps of the records (at most {with_units(details['resolution'])} in "
-        "single coordinates, more in several at once)",
+        "its dynamics in the gaps of the records being like those beside the gaps (at most "
+        f"{with_units(details['resolution'])} wide in single coordinates, wider in several at once)",
     ]
 
 
@@ -300,8 +300,8 @@ def envelope_statement(envelope: Envelope) -> str:
     if envelope.irregular:
         steps = "1 recorded step is" if envelope.irregular == 1 else f"{envelope.irregular} recorded steps are"
         sentences.append(
-            f"{steps} no smooth function of what is recorded, as contacts are; tasks whose runs come to states like "
-            "theirs are not trusted."
+            f"{steps} not explained by a smooth function of state and input, as at a contact; tasks whose predicted "
+            "runs come near such states are not trusted."
         )
     if envelope.share and envelope.tasks is None and not envelope.checks:
         sentences.append(

@@ -46,9 +46,9 @@ def falsified(
         return (
             f"trial {worst.number} failed ({quoted(worst.failure or '')}), but its distance is at least "
             f"{quantities.of(distance)} by the steps before the failure, which exceeds {quantities.of(limit)}, in the "
-            f"task {quantities.task(worst)}; if a fault caused this that is mended by now, execute the task again and "
-            f'say what it was (`ctxval run` with --again-failed "...", or `ctxval ask STORE --again {worst.number} '
-            '--because "..."` if people execute it).'
+            f"task {quantities.task(worst)}; if the cause was a fault that has been repaired, execute the task again "
+            'and state the repair (`ctxval run` with --again-failed "...", or '
+            f'`ctxval ask STORE --again {worst.number} --because "..."` if people execute it).'
         )
     again = [(trial.distance or 0.0) > tau for trial in executions_of(worst, trials) if trial is not worst]
     reproduced = ", executed once" if not again else ""
@@ -168,8 +168,8 @@ def rests_on(
     made_good = details.get("failures", {}).get("made_good", [])
     if made_good:
         numbers = ", ".join(str(failure["trial"]) for failure in made_good)
-        parts.append(f"your word that what made trial {numbers} fail is removed for good")
-    parts += [f"your word that {remark}" for remark in known.remarks if remark != REFINED]
+        parts.append(f"your statement that the cause of the failure of trial {numbers} was removed permanently")
+    parts += [f"your statement that {remark}" for remark in known.remarks if remark != REFINED]
     parts += _not_selected(known, known.known_before(tau, trials), tau)
     text = f"{_evidence(certificate, tau, known.quantities)}It rests on {'; on '.join(parts)}."
     tests = details.get("tests", {})
@@ -178,10 +178,9 @@ def rests_on(
     draws = [f"{counted(tests['spread'], 'test')} drawn as a Latin hypercube"] if tests["spread"] else []
     draws += [counted(tests["independent"], "independent draw")] if tests["independent"] else []
     return (
-        f"{text} Without these assumptions, the tests alone show that at most "
-        f"{at_most(100 * tests['share_missed'], 2)} % {of_tasks(certificate.distribution)} exceed "
-        f"{known.quantities.of(f'{tau:.6g}')} "
-        f"({' and '.join(draws)}, {percent(certificate.confidence)})."
+        f"{text} Without these assumptions, the tests alone show with {percent(certificate.confidence)} confidence "
+        f"that at most {at_most(100 * tests['share_missed'], 2)} % {of_tasks(certificate.distribution)} exceed "
+        f"{known.quantities.of(f'{tau:.6g}')} ({' and '.join(draws)})."
     )
 
 
@@ -204,9 +203,9 @@ def _evidence(certificate: Certificate, tau: float, quantities: Quantities) -> s
     if (pushes := tolerances(certificate, tau)) is not None:
         everywhere, away = pushes
         text += (
-            f" The bound would survive a further error of M, beyond what was learned, of {_push(everywhere)} at every "
-            f"step, or of {_push(away)} where no record is near; the largest error that was recorded, and learned, is "
-            f"{_rate(everywhere.state, everywhere.residual)}."
+            " No tried task exceeds the threshold under a further error of M, beyond what was learned, of up to "
+            f"{_push(everywhere)} at every step, or of {_push(away)} where no record is near; the largest recorded "
+            f"error of M is {_rate(everywhere.state, everywhere.residual)}."
         )
     if (pocket := details.get("pocket")) is not None:
         text += (

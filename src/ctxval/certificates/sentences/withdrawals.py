@@ -30,8 +30,8 @@ NOISE_CONTRADICTED = (
     "record more states"
 )
 LEFT_OUT = (
-    "the posterior samples of the dynamics leave out {percent:.0f} % of the largest variance, more than {most:g} %; "
-    "more executions reduce this variance"
+    "the posterior samples of the dynamics understate the predictive uncertainty: they lack {percent:.0f} % of the "
+    "largest posterior variance, and at most {most:g} % is allowed; more executions reduce it"
 )
 BEYOND = "predicted runs leave the recorded range of {gap}"
 GAP = "predicted runs enter a gap in the records of {gap}"
@@ -93,9 +93,9 @@ BARE_CORNERS = (
 
 # Remarks on later changes of a store
 
-ACCEPTED = "what was changed after {trials} trials makes no difference to them, as you state: {why!r} ({differences})"
+ACCEPTED = "what was changed after {trials} trials makes no difference to them: {why!r} ({differences})"
 MEASURED_ANEW = "the distances are those measured anew: {why!r}"
-REPLACED = "the result of trial {numbers} that was told first is wrong, as you state: {why!r}"
+REPLACED = "the result of trial {numbers} that was told first is wrong: {why!r}"
 REFINED = (
     "the model was learned again from executions of earlier models: these are data of the model and no trials of it, "
     "so only executions under its own controllers are counted"

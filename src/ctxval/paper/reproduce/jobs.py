@@ -66,7 +66,10 @@ def measured_with(results: Iterable[Mapping[str, Any]], folders: tuple[str, ...]
     without = sum("sources" not in result for result in known)
     before = sum(result.get("sources", present) != present for result in known)
     counts = {f"with the present sources of {names}": len(known) - before - without}
-    counts |= {"before their last change": before, "before results named their sources and libraries": without}
+    counts |= {
+        "before the last change of the source": before,
+        "before results named their sources and libraries": without,
+    }
     measured = "; ".join(f"{when}: {count:,}" for when, count in counts.items() if count)
     used = sorted({result["libraries"] for result in known if "libraries" in result})
     return f"Results measured {measured}." + (f" Libraries: {'; '.join(used)}." if used else "")
