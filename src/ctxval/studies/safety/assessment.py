@@ -22,7 +22,7 @@ from ctxval.campaign.history import executed_trials
 from ctxval.certificates import Certificate, CertificateOptions, Dynamics
 from ctxval.certificates.bounds import ERRORS, rank_of
 from ctxval.certificates.dynamics import draws_for
-from ctxval.certificates.verdict import Answer
+from ctxval.certificates.verdict import Answer, Verdict
 from ctxval.core.distance import selected
 from ctxval.core.experiment import Experiment
 from ctxval.core.trajectory import Trajectory
@@ -159,32 +159,14 @@ def assess(
     """
     validation, options = campaign.validation, certificate or CertificateOptions(Dynamics())
     distance, space = spec_distance(validation), validation.space
-    spec, margin = distance.spec, distance.margin
+    spec, deviation = distance.spec, MaximumDeviation(2, getattr(distance.spec, "components", None))
     with progress_shown(progress):
         runs = executed_trials(campaign.store, campaign.trials)
-        executed = [_compared(campaign, trial, system) for trial, system in runs]
-        violated = (task for task, _ in executed if task.on_system <= 0 < task.on_model)
-        unsafe = sorted(violated, key=lambda task: -task.on_model)
-        verdict = None if margin is None else campaign.verdict(margin, certificate=options)
-        certified, doubt = None if verdict is None else verdict.certificate, None
-        if verdict is None:
-            try:
-                certified = campaign.certify(certificate=options)
-            except CertificateError as error:
-                doubt = str(error).removesuffix(".")
-        bound = None if certified is None else certified.bound
-        if verdict is not None:
-            bound = margin if verdict.answer == "validated" else None
-            doubt = verdict.reason.removesuffix(".")
-        elif bound is not None and certified is not None:
-            # Share of a bound on d_b by which a search may end below its largest value, which lies on a ridge: in the
-            # study of ``docs/how-to/safety.md``, it ended by up to 0.2 % below.
-            searched = max(certified.details.get("disagreement") or 0.0, 0.01)
-            bound = (1 + searched) * (bound + ERRORS * certified.error)
-        elif certified is not None:
-            doubt = certified.doubt or "the certificate leaves out a share of the tasks"
+        executed = [_compared(campaign, trial, system, deviation) for trial, system in runs]
+        d_a = max((deviated for _, deviated, _ in executed), default=0.0)
+        verdict, certified, bound, doubt = _bound(campaign, distance.margin, options)
         with stage("predicting the largest deviation", unit="closed loops"):
-            of_deviation = _deviation_bound(campaign, spec, options.confidence)
+            predicted = _deviation_bound(campaign, runs, deviation, options.confidence)
         planner, unit = LoopPlanner(validation), space.members
         if unit is None:
             count = tasks if planner.batched else max(tasks // 10, 1)
@@ -193,64 +175,87 @@ def assess(
             rho = on_model(planner, spec, unit)
     if not (rho > 0).any():
         raise InputError(f"none of {len(unit)} drawn tasks satisfies the specification on the model.")
-    if bound is None and not campaign.failed and not (campaign.worst is not None and campaign.worst.distance):
-        doubt = (
-            "no executed task came near a violation, so that no prediction of one was tested; ask for a margin, or "
-            "draw tasks with an audit"
-        )
-    deviation = max((moved for _, moved in executed), default=0.0)
-    of_deviation = None if of_deviation is None else max(of_deviation, deviation)
-    by_deviation = None  # a failed execution has deviations that nobody knows
-    if of_deviation is not None and not campaign.failed:
-        by_deviation = float((rho > of_deviation).mean())
-    looked_at = [selected(system.states, getattr(spec, "components", None)) for _, system in runs]
-    between = max((float(np.linalg.norm(np.diff(x, axis=0), axis=-1).max()) for x in looked_at), default=0.0)
+    d_a_bound = None if predicted is None else max(predicted, d_a)
+    violated = (task for task, *_ in executed if task.on_system <= 0 < task.on_model)
+    unsafe = sorted(violated, key=lambda task: -task.on_model)
+    known = None if campaign.failed else d_a_bound  # a failed execution has deviations that nobody knows
     tightened = None
     if bound is not None and isinstance(spec, ReachAvoid):
         with suppress(InputError):  # nothing is left of a set
             tightened = spec.tightened(bound)
     return SafetyReport(
         spec=spec,
-        margin=margin,
+        margin=distance.margin,
         answer=None if verdict is None else verdict.answer,
         reason=None if verdict is None else verdict.reason,
-        d_a=deviation,
-        d_a_bound=of_deviation,
-        d_b=max((task.on_model for task in unsafe), default=0.0),
+        d_a=d_a,
+        d_a_bound=d_a_bound,
+        d_b=unsafe[0].on_model if unsafe else 0.0,
         d_b_bound=bound,
         counterexamples=tuple(unsafe),
         certificate=certified,
-        doubt=None if bound is not None else doubt,
+        doubt=doubt,
         tasks=len(unit),
         share_satisfied=float((rho > 0).mean()),
         share_certified=None if bound is None else float((rho > bound).mean()),
-        share_by_deviation=by_deviation,
+        share_by_deviation=None if known is None else float((rho > known).mean()),
         tightened=tightened,
-        between=between,
+        between=max((moved for *_, moved in executed), default=0.0),
         executions=campaign.executions,
         confidence=options.confidence,
         units=validation.labels.units,
     )
 
 
-def _compared(campaign: Campaign, trial: Trial, system: Trajectory) -> tuple[UnsafeTask, float]:
-    """Return the robustness of both trajectories of an executed task, and how far they deviate."""
+def _compared(
+    campaign: Campaign, trial: Trial, system: Trajectory, deviation: MaximumDeviation
+) -> tuple[UnsafeTask, float, float]:
+    """Return the robustness of both trajectories, how far they deviate, and how far S moved in a step at most."""
     validation, spec = campaign.validation, spec_distance(campaign.validation).spec
-    task = validation.task_at(validation.space.parameters(validation.space.from_unit(trial.unit_point)))
-    model, _ = campaign.trajectories(trial)
+    parameters = validation.space.parameters(validation.space.from_unit(trial.unit_point))
+    task, model = validation.task_at(parameters), campaign.store.trajectory(trial.number, "model")
     if model is None:
         model = validation.plan(validation.space.from_unit(trial.unit_point)).model_trajectory
     of_model, of_system = (float(spec.robustness(run, task)) for run in (model, system))
-    deviation = MaximumDeviation(2, getattr(spec, "components", None))(model, system, task)
-    return UnsafeTask(trial.number, trial.parameters, of_model, of_system), float(deviation)
+    moved = np.linalg.norm(np.diff(selected(system.states, deviation.components), axis=0), axis=-1).max()
+    compared = UnsafeTask(trial.number, trial.parameters, of_model, of_system)
+    return compared, float(deviation(model, system, task)), float(moved)
 
 
-def _deviation_bound(campaign: Campaign, spec: Any, confidence: float) -> float | None:
+def _bound(
+    campaign: Campaign, margin: float | None, options: CertificateOptions
+) -> tuple[Verdict | None, Certificate | None, float | None, str | None]:
+    """Return the verdict on a margin, if there is one, the certificate, and the bound on d_b or why there is none."""
+    untested = None
+    if not campaign.failed and not (campaign.worst is not None and campaign.worst.distance):
+        untested = (
+            "no executed task came near a violation, so that no prediction of one was tested; ask for a margin, or "
+            "draw tasks with an audit"
+        )
+    if margin is not None:
+        verdict = campaign.verdict(margin, certificate=options)
+        if verdict.answer == "validated":
+            return verdict, verdict.certificate, margin, None
+        return verdict, verdict.certificate, None, untested or verdict.reason.removesuffix(".")
+    try:
+        certified = campaign.certify(certificate=options)
+    except CertificateError as error:
+        return None, None, None, untested or str(error).removesuffix(".")
+    if certified.bound is None:
+        return None, certified, None, untested or certified.doubt or "the certificate leaves out a share of the tasks"
+    # Share of a bound on d_b by which a search may end below its largest value, which lies on a ridge: in the
+    # study of ``docs/how-to/safety.md``, it ended by up to 0.2 % below.
+    searched = max(certified.details.get("disagreement") or 0.0, 0.01)
+    return None, certified, (1 + searched) * (certified.bound + ERRORS * certified.error), None
+
+
+def _deviation_bound(
+    campaign: Campaign, runs: list[tuple[Trial, Trajectory]], deviation: MaximumDeviation, confidence: float
+) -> float | None:
     """Return the bound that learned dynamics give on the largest deviation; None if they give none."""
-    validation = campaign.validation.with_parts(distance=MaximumDeviation(2, getattr(spec, "components", None)))
-    pairs = [(trial.unit_point, system) for trial, system in executed_trials(campaign.store, campaign.trials)]
+    validation = campaign.validation.with_parts(distance=deviation)
     with suppress(Exception):  # users' parts, at states that no execution has reached
-        learned = DynamicsStudy(validation, campaign.seed).learn(pairs)
+        learned = DynamicsStudy(validation, campaign.seed).learn([(trial.unit_point, system) for trial, system in runs])
         if learned is not None:
             maxima = learned.worst_case_of(draws_for(confidence)).maxima
             bound = float(np.sort(maxima)[min(rank_of(confidence, len(maxima)), len(maxima)) - 1])
