@@ -53,34 +53,47 @@ class InputGain(Cause):
 
 
 @dataclass(frozen=True)
-class InputOffset(Cause):
-    """An input has an offset. Size: the offset, in units of the input."""
+class OfInput(Cause):
+    """A cause in one input. A subclass has the formula of what acts, and the sentence."""
 
-    name: ClassVar[str] = "input offset"
     input: int = 0
+    sentence: ClassVar[str]  #: with the ``name`` and ``unit`` of the input and the ``size``; ``play`` is twice the size
+
+    def acts(self, u: Array, before: Array) -> Array:
+        """Return what acts ``(...)`` for what is commanded of the input, and what acted before, 0 at first."""
+        raise NotImplementedError
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        return u + _at(u, self.input, self.sizes[0]), None
+        acting = np.array(u, dtype=np.float64)
+        before = np.zeros_like(acting) if memory is None else memory
+        acting[..., self.input] = self.acts(acting[..., self.input], before[..., self.input])
+        return acting, acting if self.remembers else None
 
     def text(self, plant: Plant) -> str:
-        name, unit = plant.inputs[self.input]
-        return f"{name} has an offset of {self.sizes[0]:.3g} {unit}".rstrip()
+        (name, unit), (size,) = plant.inputs[self.input], self.sizes or (0.0,)
+        return self.sentence.format(name=name, unit=unit, size=size, play=2 * size).rstrip()
 
 
 @dataclass(frozen=True)
-class Saturation(Cause):
+class InputOffset(OfInput):
+    """An input has an offset. Size: the offset, in units of the input."""
+
+    name: ClassVar[str] = "input offset"
+    sentence: ClassVar[str] = "{name} has an offset of {size:.3g} {unit}"
+
+    def acts(self, u: Array, before: Array) -> Array:
+        return u + self.sizes[0]
+
+
+@dataclass(frozen=True)
+class Saturation(OfInput):
     """An input is limited. Size: the limit of its magnitude."""
 
     name: ClassVar[str] = "saturation"
-    input: int = 0
+    sentence: ClassVar[str] = "{name} saturates at {size:.3g} {unit}"
 
-    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        most = _at(u, self.input, self.sizes[0], np.inf)
-        return np.clip(u, -most, most), None
-
-    def text(self, plant: Plant) -> str:
-        name, unit = plant.inputs[self.input]
-        return f"{name} saturates at {self.sizes[0]:.3g} {unit}".rstrip()
+    def acts(self, u: Array, before: Array) -> Array:
+        return np.clip(u, -self.sizes[0], self.sizes[0])
 
     def mjcf(self, plant: Plant) -> str | None:
         if plant.compiled is None:
@@ -90,37 +103,38 @@ class Saturation(Cause):
 
 
 @dataclass(frozen=True)
-class DeadZone(Cause):
+class DeadZone(OfInput):
     """An input has no effect near 0. Size: the magnitude below which it has none, and which is lost above."""
 
     name: ClassVar[str] = "dead zone"
-    input: int = 0
+    sentence: ClassVar[str] = "{name} has a dead zone of {size:.3g} {unit}"
 
-    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        lost = _at(u, self.input, self.sizes[0])
-        return u - np.clip(u, -lost, lost), None
-
-    def text(self, plant: Plant) -> str:
-        name, unit = plant.inputs[self.input]
-        return f"{name} has a dead zone of {self.sizes[0]:.3g} {unit}".rstrip()
+    def acts(self, u: Array, before: Array) -> Array:
+        return u - np.clip(u, -self.sizes[0], self.sizes[0])
 
 
 @dataclass(frozen=True)
-class Backlash(Cause):
+class Backlash(OfInput):
     """An input follows with play. Size: half of the play, in units of the input."""
 
     name: ClassVar[str] = "backlash"
+    sentence: ClassVar[str] = "{name} has backlash of {play:.3g} {unit}"
     remembers: ClassVar[bool] = True
-    input: int = 0
 
-    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        play = _at(u, self.input, self.sizes[0])
-        acting = np.clip(np.zeros_like(u) if memory is None else memory, u - play, u + play)
-        return acting, acting
+    def acts(self, u: Array, before: Array) -> Array:
+        return np.clip(before, u - self.sizes[0], u + self.sizes[0])
 
-    def text(self, plant: Plant) -> str:
-        name, unit = plant.inputs[self.input]
-        return f"{name} has backlash of {2 * self.sizes[0]:.3g} {unit}".rstrip()
+
+@dataclass(frozen=True)
+class ReversedInput(OfInput):
+    """An input acts with the opposite sign."""
+
+    sizes: tuple[float, ...] = ()
+    name: ClassVar[str] = "reversed input"
+    sentence: ClassVar[str] = "{name} acts with the opposite sign"
+
+    def acts(self, u: Array, before: Array) -> Array:
+        return -u
 
 
 @dataclass(frozen=True)
@@ -170,21 +184,6 @@ class SwappedInputs(Cause):
 
     def text(self, plant: Plant) -> str:
         return f"the inputs {plant.inputs[self.first][0]} and {plant.inputs[self.second][0]} are exchanged"
-
-
-@dataclass(frozen=True)
-class ReversedInput(Cause):
-    """An input acts with the opposite sign."""
-
-    sizes: tuple[float, ...] = ()
-    name: ClassVar[str] = "reversed input"
-    input: int = 0
-
-    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        return u * _at(u, self.input, -1.0, 1.0), None
-
-    def text(self, plant: Plant) -> str:
-        return f"{plant.inputs[self.input][0]} acts with the opposite sign"
 
 
 @dataclass(frozen=True)
