@@ -99,6 +99,26 @@ def stepped(controller: Controller, t: int, x: Array, memory: Any) -> tuple[Any,
     return controller(t, x), memory
 
 
+def seeing(controller: Controller, seen: Callable[[Array], Array], of_task: Callable[[Task], Task]) -> Controller:
+    """Return a controller of states for one that sees a function of them, and starts from a function of the task."""
+    if isinstance(controller, ControllerWithMemory):
+        return _SeeingController(controller, seen, of_task)
+    return lambda t, x: controller(t, seen(x))
+
+
+@dataclass(frozen=True)
+class _SeeingController:
+    controller: ControllerWithMemory
+    seen: Callable[[Array], Array]
+    of_task: Callable[[Task], Task]
+
+    def start(self, task: Task) -> Any:
+        return self.controller.start(self.of_task(task))
+
+    def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
+        return self.controller.step(t, self.seen(x), memory)
+
+
 def each_alone(controllers: Sequence[Controller], tasks: Sequence[Task]) -> Feedback:
     """Return controllers of tasks as one of their batch, whose inputs are to the last digit those of each alone."""
     runs = [started(controller, task) for controller, task in zip(controllers, tasks, strict=True)]

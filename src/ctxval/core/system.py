@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from ctxval._util.arrays import Array, rows_of
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval.core.controller import Controller, ControllerWithMemory
+from ctxval.core.controller import Controller, seeing
 from ctxval.core.model import Model, Step, as_model, central_differences
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
@@ -93,24 +93,7 @@ class Outputs(ShortRepr):
 
         A task is the one from which a controller with memory starts, if the states are not those of M.
         """
-        if isinstance(controller, ControllerWithMemory):
-            return _OutputController(controller, self, task)
-        return lambda t, x: controller(t, self(x))
-
-
-@dataclass(frozen=True)
-class _OutputController:
-    """A controller with memory that sees the outputs alone."""
-
-    controller: ControllerWithMemory
-    outputs: Outputs
-    task: Task | None
-
-    def start(self, task: Task) -> Any:
-        return self.controller.start(task if self.task is None else self.task)
-
-    def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
-        return self.controller.step(t, self.outputs(x), memory)
+        return seeing(controller, self, lambda given: given if task is None else task)
 
 
 def as_outputs(given: OutputsLike | Outputs | None) -> Outputs | None:

@@ -19,7 +19,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
-from ctxval.core.controller import Controller, ControllerWithMemory, Synthesizer
+from ctxval.core.controller import Controller, Synthesizer, seeing
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.model import Model
@@ -247,28 +247,9 @@ class _ExtendedSynthesizer:
 
     def design(self, task: Task, model: Model) -> Controller:
         designed = self.synthesizer.design(_plain(task), model if self.model is None else self.model)
-        seeing = designed if self.outputs is None else self.outputs.seen_by(designed)
-        controller = _without_parameters(seeing, self.k) if self.k else seeing
+        controller = designed if self.outputs is None else self.outputs.seen_by(designed)
+        controller = seeing(controller, lambda x: x[..., : -self.k], _plain) if self.k else controller
         return controller if self.actuator is None else ActuatedController(controller, self.actuator)
-
-
-def _without_parameters(controller: Controller, k: int) -> Controller:
-    """Return a controller that sees all states but the last k."""
-    if isinstance(controller, ControllerWithMemory):
-        return _ExtendedController(controller, k)
-    return lambda t, x: controller(t, x[..., :-k])
-
-
-@dataclass(frozen=True)
-class _ExtendedController:
-    controller: ControllerWithMemory
-    k: int
-
-    def start(self, task: Task) -> Any:
-        return self.controller.start(_plain(task))
-
-    def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
-        return self.controller.step(t, x[..., : -self.k], memory)
 
 
 @dataclass(frozen=True)
