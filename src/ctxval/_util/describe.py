@@ -6,8 +6,10 @@ value: attributes, closures, globals and defaults may be secrets.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
+import json
 import math
 import numbers
 from collections.abc import Iterator, Mapping
@@ -73,6 +75,16 @@ def describe(value: Any, depth: int = 6) -> Any:
 def _source(value: Any) -> dict[str, str]:
     digest = source_digest(value)
     return {} if digest is None else {"source": digest}
+
+
+def plain_json(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values, dataclasses among them, as they are read from JSON; a number that is not finite is None."""
+
+    def fields(part: Any) -> Any:
+        own = getattr(part, "to_json", None)
+        return own() if own else {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
+
+    return dict(json.loads(json.dumps(values, default=fields), parse_constant=lambda _: None))
 
 
 def without_numbers(description: Any) -> Any:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ import numpy as np
 
 from ctxval._util.arrays import single_threaded
 from ctxval._util.columns import TIMES, named_unit, time_column
+from ctxval._util.describe import plain_json
 from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.texts import enumerated
 from ctxval.core.model import Model
@@ -26,7 +27,7 @@ from ctxval.studies.fitting import FitReport, fit
 from ctxval.studies.fitting.fit import FittedModel
 from ctxval.studies.replay import ReplayReport, replay
 from ctxval.studies.replay.accuracy import step_errors
-from ctxval.studies.replay.report import plain_numbers, unseen
+from ctxval.studies.replay.report import unseen
 
 Role = Literal["state", "input", ""]
 
@@ -99,17 +100,17 @@ class Survey(ShortRepr):
         """Return all results as plain values."""
         values = {
             "sources": self.sources,
-            "fields": list(map(asdict, self.fields)),
+            "fields": self.fields,
             "states": self.recordings.states,
             "inputs": self.recordings.inputs,
             "guesses": self.guesses,
-            "fit": self.fit.to_json(),
-            "replay": self.replay.to_json(),
+            "fit": self.fit,
+            "replay": self.replay,
             "close": self.reach[0],
             "compared": self.reach[1],
             "statement": self.statement,
         }
-        return plain_numbers(values)
+        return plain_json(values)
 
 
 def survey(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
@@ -12,6 +12,7 @@ from scipy.special import stdtrit
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.checked import Must, require
+from ctxval._util.describe import plain_json
 from ctxval._util.representation import ShortRepr, counted
 from ctxval.core.model import Model, require_time_step
 from ctxval.core.trajectory import Trajectory, Transitions
@@ -20,7 +21,6 @@ from ctxval.errors import InputError, ModelError, UnknownNameError
 from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.parametric import ParametricStep
 from ctxval.studies.replay.accuracy import StepError, step_errors, stepped
-from ctxval.studies.replay.report import plain_numbers
 
 Kind = Literal["linear", "network", "gaussian-process", "parameters", "given"]
 KINDS: tuple[Kind, ...] = get_args(Kind)[:4]
@@ -91,20 +91,12 @@ class FitReport(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all results but the models as plain values; numbers that are not finite are None."""
-        fitted = [
-            {
-                "kind": model.kind,
-                "errors": [{**asdict(error), "relative": error.relative} for error in model.errors],
-                "parameters": list(map(asdict, model.parameters)),
-                "notes": model.notes,
-                "useless": model.useless,
-            }
-            for model in self.fitted
-        ]
+        names = ("kind", "errors", "parameters", "notes", "useless")
+        fitted = [{name: getattr(model, name) for name in names} for model in self.fitted]
         parts = {"learned_from": self.learned_from, "held_out": self.held_out}
         sizes = {name: {"recordings": len(part.runs), "steps": part.steps} for name, part in parts.items()}
         about = {"dt": self.held_out.dt, "notes": self.held_out.notes}
-        return plain_numbers({"fitted": fitted, "failed": list(map(asdict, self.failed)), **sizes, **about})
+        return plain_json({"fitted": fitted, "failed": self.failed, **sizes, **about})
 
 
 def fit(

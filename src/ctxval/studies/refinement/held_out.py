@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.describe import plain_json
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import aligned
 from ctxval.core.labels import labels_of
@@ -238,23 +239,23 @@ class MeasuredResidual(ShortRepr):
     def to_json(self) -> dict[str, Any]:
         """Return all numbers as plain values; an end that is infinite is None."""
 
-        def plain(region: ResidualRegion) -> dict[str, Any]:
-            ends = self._ends(region)
+        def described(region: ResidualRegion) -> dict[str, Any]:
             return {
-                "range": {name: [end if np.isfinite(end) else None for end in pair] for name, *pair in ends},
+                "range": {name: ends for name, *ends in self._ends(region)},
                 "steps": region.steps,
                 "quantile": dict(zip(self.states, region.quantile.tolist(), strict=True)),
                 "largest": dict(zip(self.states, region.largest.tolist(), strict=True)),
             }
 
-        return {
+        values = {
             "quantile_level": 0.95,
             "units": {**self.states, **self.inputs},
-            "whole": plain(self.whole),
-            "left_out": self.left_out and plain(self.left_out),
-            "regions": [plain(region) for region in self.regions],
+            "whole": described(self.whole),
+            "left_out": self.left_out and described(self.left_out),
+            "regions": list(map(described, self.regions)),
             "guaranteed": False,
         }
+        return plain_json(values)
 
 
 def measure_residual(held: HeldOut, states: dict[str, str], inputs: dict[str, str]) -> MeasuredResidual:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +38,10 @@ class StepError(ShortRepr):
     def relative(self) -> float:
         """The error as a share of the recorded change; 1 or more means that the model predicts nothing."""
         return self.rms / self.change if self.change > 0 else (0.0 if self.rms == 0 else float("inf"))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all numbers as plain values."""
+        return {**vars(self), "relative": self.relative}
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.boxes import separated_rows
 from ctxval._util.checked import Must, require
 from ctxval._util.columns import unit_advice
+from ctxval._util.describe import plain_json
 from ctxval._util.representation import ShortRepr, counted, task_text
 from ctxval.core.model import Model, require_time_step
 from ctxval.core.trajectory import Trajectory, Transitions
@@ -153,8 +153,7 @@ class ReplayReport(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values; numbers that are not finite are None."""
-        errors = [{**asdict(error), "relative": error.relative} for error in self.errors]
-        return plain_numbers({**asdict(self), "errors": errors})
+        return plain_json(vars(self))
 
 
 def replay(
@@ -230,11 +229,6 @@ def unseen(model: Model, recordings: Recordings) -> list[int]:
     known = set(rows(data))
     recorded = [rows(run.trajectory.transitions()) for run in recordings.runs]
     return [k for k, steps in enumerate(recorded) if sum(step in known for step in steps) <= len(steps) / 2]
-
-
-def plain_numbers(value: dict[str, Any]) -> dict[str, Any]:
-    """Return plain values for JSON; numbers that are not finite are None."""
-    return dict(json.loads(json.dumps(value), parse_constant=lambda _: None))
 
 
 # What follows, in sentences
