@@ -71,10 +71,9 @@ class ClosedLoops:
         Noise of measurements, white with standard deviations ``(n,)``, acts on the system through the controller, and
         may move it out of dead zones and plays.
         """
-        outputs = self.validation.outputs is not None
-        loops = [] if outputs else self._noisy(repaired, execution, noise)
+        loops = self._noisy(repaired, execution, noise)
         if not loops:
-            start = None if outputs else execution.executed.states[0]
+            start = None if self.validation.outputs is not None else execution.executed.states[0]
             loop = self.of_plan(repaired, execution.plan, execution.executed.horizon, start)
             if loop is None:
                 return Predicted(np.inf, np.zeros(1), np.inf)
@@ -158,15 +157,12 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
     failed = list[tuple[Trial, Trajectory]]()
     for trial in campaign.failed if validation.outputs is None else ():
         promised, run = campaign.trajectories(trial)
-        if promised is None or run is None:
-            continue
-        # What was recorded until the system left the surroundings of what M promised.
-        far = np.abs(run.states - promised.states[0]) > _AWAY * np.ptp(promised.states, axis=0).clip(1e-12)
-        near = np.flatnonzero(far.any(axis=1))
-        steps = min([run.horizon, *(near[:1] - 1)])
-        if steps >= _STEPS:
-            failed.append((trial, run.first(steps)))
-    failed = failed[:_FAILED]
+        if promised is not None and run is not None and len(failed) < _FAILED:
+            # What was recorded until the system left the surroundings of what M promised.
+            far = np.abs(run.states - promised.states[0]) > _AWAY * np.ptp(promised.states, axis=0).clip(1e-12)
+            steps = min([run.horizon, *(np.flatnonzero(far.any(axis=1))[:1] - 1)])
+            if steps >= _STEPS:
+                failed.append((trial, run.first(steps)))
     trials = failed + trials[: 8 - len(failed)]  # those with the largest distances
     if len(trials) < 2:
         raise InputError(

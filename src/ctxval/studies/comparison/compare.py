@@ -97,10 +97,9 @@ def compare(
             executions.resume()
             while _step(questions, worst, mean, budget):
                 advance()
-    asked: dict[Question, WorstQuestion | MeanQuestion] = {"worst": worst, "mean": mean}
     return Comparison(
         tuple(_result(candidate, worst, mean) for candidate in made),
-        tuple(asked[name].pair(*pair) for name in questions for pair in combinations(made, 2)),
+        tuple((worst if name == "worst" else mean).pair(*pair) for name in questions for pair in combinations(made, 2)),
         confidence,
         executions.count,
         budget,
