@@ -39,7 +39,7 @@ from ctxval.certificates.envelope import (
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.sample import without_success
-from ctxval.core.trial import Trial
+from ctxval.core.trial import Trial, Trials
 from ctxval.errors import InputError
 from ctxval.learning import LearnedDynamics
 
@@ -65,7 +65,7 @@ class EnvelopeSearch:
 
     def envelope(self) -> Envelope:
         """Return the envelope that the executions give, or why there is none. The system is never executed."""
-        space, trials = self._recorder.validation.space, self._ended()
+        space, trials = self._recorder.validation.space, self._recorder.trials.ended
         threshold, confidence = self._threshold, self._confidence
         unknown = next((trial for trial in without_success(trials) if trial.least <= threshold), None)
         if unknown is not None:
@@ -105,7 +105,7 @@ class EnvelopeSearch:
             if (doubt := doubt_of_envelope(evidence, threshold)) is not None:
                 return withdrawn(space, threshold, confidence, doubt)
             if failed:
-                predicted = learned.expected(np.array([trial.unit_point for trial in failed]))
+                predicted = learned.expected(Trials(failed).points(space.dimension))
                 for trial, distance in zip(failed, predicted.tolist(), strict=True):
                     if distance <= threshold:
                         doubt = f"trial {trial.number} failed beyond the threshold, and the learned dynamics keep it"
@@ -157,7 +157,7 @@ class EnvelopeSearch:
 
         It is None if executions may differ by noise: then others may be needed to falsify the model.
         """
-        interval, trials, recorder = self._interval, self._ended(), self._recorder
+        interval, recorder, trials = self._interval, self._recorder, self._recorder.trials.ended
         if interval.best <= self._threshold or not interval.predicts or not recorder.has_tasks:
             return None
         known = self._known(trials)
@@ -172,7 +172,7 @@ class EnvelopeSearch:
         records. The larger of these two parts is worked on. Tests come last, when hardly anything is uncertain or the
         budget is just enough for them: those that are predicted by better dynamics raise k less.
         """
-        interval, recorder, trials = self._interval, self._recorder, self._ended()
+        interval, recorder, trials = self._interval, self._recorder, self._recorder.trials.ended
         if not interval.predicts or not recorder.has_tasks:
             return None
         if any(trial.least <= self._threshold for trial in without_success(trials)):
@@ -201,7 +201,7 @@ class EnvelopeSearch:
         # Share of the tasks predicted below the threshold that may be uncertain or uncovered at the end.
         if few or (uncertain | uncovered).sum() > 0.03 * below.sum():
             score = straddle if uncertain.sum() >= uncovered.sum() else np.where(uncovered, leaving, -np.inf)
-            executed = np.array([trial.unit_point for trial in recorder.trials])
+            executed = recorder.trials.points(recorder.validation.space.dimension)
             away = np.abs(drawn.points[:, None] - executed).max(axis=2)
             new = (away > (0.0 if is_suite else NEAR)).all(axis=1)
             if (np.isfinite(score) & new).any():
@@ -213,10 +213,7 @@ class EnvelopeSearch:
     def _left(self) -> int:
         """The number of executions that the budget leaves."""
         recorder = self._recorder
-        return self._interval.budget - recorder.executions - sum(trial.state == "open" for trial in recorder.trials)
-
-    def _ended(self) -> list[Trial]:
-        return [trial for trial in self._recorder.trials if trial.state != "open"]
+        return self._interval.budget - recorder.trials.executions - len(recorder.trials.open)
 
     def _known(self, trials: Sequence[Trial]) -> tuple[LearnedDynamics, DynamicsEvidence] | None:
         """Return what the executions teach, and what they say of the predictions."""
@@ -254,7 +251,7 @@ def has_tests(recorder: TrialRecorder, options: CertificateOptions) -> bool:
     """Return whether the tests of an envelope were executed, so that it is worth computing; nothing is learned."""
     if not isinstance(options.kind, Automatic | Dynamics) or not recorder.search.uses_prediction:
         return False
-    completed = [trial for trial in recorder.trials if trial.state == "completed"]
+    completed = recorder.trials.completed
     drawn = any(trial.origin in DRAWN for trial in completed)
     return drawn and _stored_tests(recorder, completed) >= options.kind.tests
 

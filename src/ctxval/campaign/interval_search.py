@@ -8,7 +8,7 @@ dynamics can be learned, if most predictions fail, or if it decides earlier, it 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,6 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
-from ctxval.campaign.history import largest_distance, waiting_points
 from ctxval.campaign.proposals import Steadiness, spread_tests
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule, Verdict
@@ -48,7 +47,7 @@ from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, MANY, TESTS
 from ctxval.certificates.sample import SAME
 from ctxval.certificates.verdict import counterexample, require_suite
-from ctxval.core.trial import Trial
+from ctxval.core.trial import Trial, Trials
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.worst_case import is_kinked
 
@@ -84,7 +83,7 @@ class IntervalSearch:
     @property
     def best(self) -> float:
         """The largest executed distance; 0 if none is known."""
-        return largest_distance(self.recorder.trials)
+        return self.recorder.trials.largest
 
     @property
     def tests(self) -> int:
@@ -125,8 +124,8 @@ class IntervalSearch:
                 return None
         if isinstance(kind, AnytimeAudit):
             # The next independent draw of an anytime audit, which may end whenever its bound suffices.
-            if any(trial.origin == "iid" for trial in self._ended):
-                sample = replace(Sample.of(self._ended), threshold=self.limit)
+            if any(trial.origin == "iid" for trial in self.recorder.trials.ended):
+                sample = replace(Sample.of(self.recorder.trials.ended), threshold=self.limit)
                 certificate = kind.certify(sample, self.options.confidence)
                 if certificate.covers(self.limit, self.options.volume):
                     return None
@@ -146,7 +145,7 @@ class IntervalSearch:
         if evidence is None or (self._fails(evidence) and not history):
             return self._by_distance()
         # The whole evidence may decide if nothing that a few draws show leaves the verdict open.
-        bound, enough = self._bound(evidence), len(self._ended) >= FEWEST
+        bound, enough = self._bound(evidence), len(self.recorder.trials.ended) >= FEWEST
         decides = enough and raised(evidence, bound) <= self.limit and doubt_of(evidence, self.best, bound) is None
         kept = dynamics.kept_evidence
         if decides and evidence.pocket is None and kept(trials, self.options.confidence) is None:
@@ -159,7 +158,9 @@ class IntervalSearch:
                 return self._by_distance()
             evidence = whole.needing(self.tests)
             with suppress(CertificateError):
-                if certify_dynamics(Sample.of(self._ended), evidence, self.options.confidence).covers(self.limit):
+                if certify_dynamics(Sample.of(trials.ended), evidence, self.options.confidence).covers(
+                    self.limit
+                ):
                     return None
         if isinstance(kind, Automatic) and evidence.quantile is None and self._suite is None:
             known = self._points(trials)
@@ -239,10 +240,10 @@ class IntervalSearch:
         if not isinstance(kind, Automatic | Posterior) or not self.limit > 0 or self._suite is not None:
             return Choice(planned_draws=0)
         rule = StoppingRule(self.limit, self.options.confidence, kind.resolution)
-        now = rule.decide(self.recorder.trials, self.budget - self.recorder.executions)
+        now = rule.decide(self.recorder.trials, self.budget - self.recorder.trials.executions)
         if not now.decided:
             return Choice(now.next_point, "covering", planned_draws=0)
-        missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self._ended))
+        missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self.recorder.trials.ended))
         return self.test() if missing else None
 
     def _by_evidence(self, evidence: DynamicsEvidence) -> Choice:
@@ -254,7 +255,7 @@ class IntervalSearch:
         steady = Steadiness(self.recorder.dynamics.study.planner, None if learned is None else learned.expected)
         # Failed ones count twice: without a reason, they are not repeated, although a start may jump next to them.
         failed = [trial for trial in trials if trial.state == "failed"]
-        known, waiting = self._points([*self._ended, *failed]), waiting_points(trials)
+        known, waiting = self._points([*self.recorder.trials.ended, *failed]), self._points(trials.open)
         # Tasks that differ in parameters that change no prediction are one task, with values that are spread.
         spread: Callable[[Array, Array], Array] | None = None
         seen: Rows | slice = slice(None)
@@ -303,12 +304,8 @@ class IntervalSearch:
     def _suite(self) -> Array | None:
         return self.recorder.validation.space.members
 
-    @property
-    def _ended(self) -> list[Trial]:
-        return [trial for trial in self.recorder.trials if trial.state != "open"]
-
-    def _points(self, trials: Sequence[Trial]) -> Array:
-        return np.array([trial.unit_point for trial in trials]).reshape(-1, self.recorder.validation.space.dimension)
+    def _points(self, trials: Iterable[Trial]) -> Array:
+        return Trials(trials).points(self.recorder.validation.space.dimension)
 
     @property
     def _near(self) -> float:
@@ -341,7 +338,7 @@ def with_next_task(verdict: Verdict, recorder: TrialRecorder, options: Certifica
     failed = any(trial.state == "failed" for trial in recorder.trials)
     if verdict.answer != "undecided" or failed or not is_decisive(options):
         return verdict
-    search = IntervalSearch(recorder, options, recorder.executions + 1, verdict.threshold, keeps=False)
+    search = IntervalSearch(recorder, options, recorder.trials.executions + 1, verdict.threshold, keeps=False)
     evidence = search._evidence()
     choice = None if evidence is None or search._fails(evidence) else search.choose()
     if choice is None or choice.unit_point is None:

@@ -10,7 +10,7 @@ import numpy as np
 from ctxval._util.checked import require
 from ctxval._util.progress import advance, stage
 from ctxval.campaign.choices import Execution
-from ctxval.campaign.history import executed_trials
+from ctxval.campaign.history import at_points, executed_trials
 from ctxval.certificates.expiry import EXCEEDED, FEWEST, Statistic, WatchedChannel, WatchState
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.core.trial import Trial
@@ -44,7 +44,7 @@ class Watch:
         self.campaign, dynamics = campaign, campaign.recorder.dynamics
         executed = executed_trials(campaign.store, campaign.trials)
         self._trials = [trial for trial, _ in executed]
-        self._executed = [(trial.unit_point, trajectory) for trial, trajectory in executed]
+        self._executed = at_points(executed)
         if len(executed) < FEWEST:
             needs = f"at least {FEWEST} executions with trajectories in the store, got {len(executed)}"
             raise CertificateError(f"a watch needs {needs}.")

@@ -18,7 +18,7 @@ from ctxval._util.progress import progress_shown, stage
 from ctxval._util.representation import ShortRepr, Shown, call, lines
 from ctxval._util.texts import parted
 from ctxval.campaign.campaign import Campaign
-from ctxval.campaign.history import executed_trials
+from ctxval.campaign.history import at_points, executed_trials
 from ctxval.certificates import Certificate, CertificateOptions, Dynamics
 from ctxval.certificates.bounds import ERRORS, rank_of
 from ctxval.certificates.dynamics import draws_for
@@ -248,9 +248,9 @@ def _compared(campaign: Campaign, trial: Trial, system: Trajectory) -> tuple[Uns
 def _deviation_bound(campaign: Campaign, spec: Any, confidence: float) -> float | None:
     """Return the bound that learned dynamics give on the largest deviation; None if they give none."""
     validation = campaign.validation.with_parts(distance=MaximumDeviation(2, getattr(spec, "components", None)))
-    pairs = [(trial.unit_point, system) for trial, system in executed_trials(campaign.store, campaign.trials)]
+    executed = at_points(executed_trials(campaign.store, campaign.trials))
     with suppress(Exception):  # users' parts, at states that no execution has reached
-        learned = DynamicsStudy(validation, campaign.seed).learn(pairs)
+        learned = DynamicsStudy(validation, campaign.seed).learn(executed)
         if learned is not None:
             maxima = learned.worst_case_of(draws_for(confidence)).maxima
             bound = float(np.sort(maxima)[min(rank_of(confidence, len(maxima)), len(maxima)) - 1])
