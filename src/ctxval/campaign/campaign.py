@@ -15,6 +15,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.checked import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Seconds, checked
 from ctxval._util.describe import describe
 from ctxval._util.progress import progress_shown, stage
+from ctxval._util.representation import call
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.dynamics import LearnedFromTrials
@@ -586,7 +587,7 @@ class Campaign:
         if not false_alarms < 1:
             raise InputError(f"false_alarms must be less than 1, such as 0.001, got {false_alarms:g}.")
         with progress_shown(progress):
-            return Watch(self, threshold, false_alarms, state)
+            return Watch(self.recorder, threshold, false_alarms, state)
 
     @checked
     def envelope(
@@ -643,7 +644,8 @@ class Campaign:
         return completed.points(self.validation.space.dimension), completed.distances
 
     def __repr__(self) -> str:
-        return display.as_text(self)
+        head = call(self, self.validation.space, name=self.name or None, seed=self.seed)
+        return display.as_text(head, self.search, self.recorder)
 
     def _repr_html_(self) -> str:
-        return display.as_html(self)
+        return display.as_html(self.name, self.seed, self.search, self.recorder)
