@@ -15,17 +15,9 @@ from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.trials import TrialRecorder
+from ctxval.certificates import dynamics_diagnostics as diagnostics
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.dynamics import Dynamics, draws_for
-from ctxval.certificates.dynamics_diagnostics import (
-    NOISE,
-    POCKET,
-    fewest_executions,
-    is_explained,
-    missing_tests,
-    most_beyond,
-    untried_parameter,
-)
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.envelope import (
     DrawnDistances,
@@ -126,7 +118,7 @@ class EnvelopeSearch:
             except Exception:  # users' parts
                 self._split = numbers, None
         learned = self._split[1]
-        if learned is None or learned.posterior.noise > NOISE:
+        if learned is None or learned.posterior.noise > diagnostics.NOISE:
             return None
         without = learned.posterior.covariances.without_model
         return learned, replace(evidence, quantile=None, lags=0, noise=learned.posterior.noise, without_model=without)
@@ -136,7 +128,7 @@ class EnvelopeSearch:
 
         Nothing was predicted of a test whose run leaves what these have recorded.
         """
-        tests, most = [], most_beyond(evidence)
+        tests, most = [], diagnostics.most_beyond(evidence)
         for test in evidence.predictions:
             if not test.stored or test.origin not in DRAWN:
                 continue
@@ -180,24 +172,24 @@ class EnvelopeSearch:
         known = self._known(trials)
         if known is None:
             return None
-        explained = all(is_explained(each, self._threshold) for each in known[1].predictions)
+        explained = all(diagnostics.is_explained(each, self._threshold) for each in known[1].predictions)
         regular = None if known[1].quantile is None and explained else self._regular(trials, known[1])
         learned, evidence = regular or known
-        missing = missing_tests(evidence.predictions, evidence.tests)
+        missing = diagnostics.missing_tests(evidence.predictions, evidence.tests)
         if missing and self._left <= missing:
             return interval.test()
-        if evidence.untried is not None and untried_parameter(evidence) is not None:
+        if evidence.untried is not None and diagnostics.untried_parameter(evidence) is not None:
             return Choice.tested(evidence.untried.task)
         pool, is_suite = learned.study.search.pool, recorder.validation.space.members is not None
         drawn = self._at(learned, pool if is_suite else pool[:_SCREENED], settled=False)
-        below, leaving = drawn.mean <= self._threshold, drawn.uncovered(most_beyond(evidence))
+        below, leaving = drawn.mean <= self._threshold, drawn.uncovered(diagnostics.most_beyond(evidence))
         # Within three spreads above the mean, a task is uncertain.
         straddle = 3.0 * drawn.spread(self._threshold) - np.abs(drawn.mean - self._threshold)  # Bryan et al. 2006
         uncertain, uncovered = below & (straddle > 0), below & (leaving > 1)
         if drawn.crossed is not None:  # executions of these tasks would not teach the regular part
             uncertain, uncovered = uncertain & (drawn.crossed <= 0), uncovered & (drawn.crossed <= 0)
             straddle = np.where(drawn.crossed <= 0, straddle, -np.inf)
-        few = evidence.executions < fewest_executions(evidence)
+        few = evidence.executions < diagnostics.fewest_executions(evidence)
         # Share of the tasks predicted below the threshold that may be uncertain or uncovered at the end.
         if few or (uncertain | uncovered).sum() > 0.03 * below.sum():
             score = straddle if uncertain.sum() >= uncovered.sum() else np.where(uncovered, leaving, -np.inf)
@@ -244,7 +236,7 @@ class EnvelopeSearch:
     def _at(self, learned: LearnedDynamics, points: Array, *, settled: bool = True) -> DrawnDistances:
         draws = draws_for(self._confidence)
         values, beyond, away, crossed = learned.drawn_distances(points, draws, settled=settled)
-        return DrawnDistances(points, values, beyond, away / POCKET, crossed)
+        return DrawnDistances(points, values, beyond, away / diagnostics.POCKET, crossed)
 
 
 def has_tests(recorder: TrialRecorder, options: CertificateOptions) -> bool:
