@@ -52,7 +52,7 @@ class ReportContext(ShortRepr):
 
     name: str  #: the name of the experiment
     space: TaskSpace
-    trials: Trials  #: all trials, in the order of asking
+    trials: tuple[Trial, ...]  #: all trials, in the order of asking
     store: Store
     verdict: Verdict | None = None  #: the verdict; None if there is no threshold
     validation: Validation | None = None  #: the map p -> d(p), which is never executed; None if it is not loaded
@@ -90,17 +90,17 @@ class ReportContext(ShortRepr):
     @functools.cached_property
     def completed(self) -> Trials:
         """The trials with a distance."""
-        return self.trials.completed
+        return Trials(self.trials).completed
 
     @functools.cached_property
     def failed(self) -> Trials:
         """The trials that failed or could not be measured."""
-        return self.trials.in_state("failed", "unmeasured")
+        return Trials(self.trials).in_state("failed", "unmeasured")
 
     @property
     def executions(self) -> int:
         """The number of executions of S that have ended."""
-        return self.trials.executions
+        return Trials(self.trials).executions
 
     @functools.cached_property
     def worst_first(self) -> tuple[Trial, ...]:
@@ -275,7 +275,7 @@ def context_of_campaign(
     return ReportContext(
         campaign.name,
         campaign.validation.space,
-        campaign.recorder.trials,
+        campaign.trials,
         campaign.store,
         verdict,
         campaign.validation,
@@ -301,7 +301,7 @@ def context_of_store(
     Without ``threshold`` there is no verdict; ``missing`` says why the experiment is not loaded, as a sentence.
     """
     with store.snapshot():
-        name, trials = store.description().get("name"), Trials(store.trials())
+        name, trials = store.description().get("name"), tuple(store.trials())
     known = provenance_of_store(store)
     space = known.space
     if space is None or any(len(trial.unit_point) != space.dimension for trial in trials):

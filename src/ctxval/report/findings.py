@@ -20,7 +20,7 @@ from ctxval.certificates import RESOLUTION
 from ctxval.certificates.bounds import at_most, of_tasks
 from ctxval.certificates.covering import bare_corners, farthest_task
 from ctxval.certificates.dynamics_diagnostics import ACCURATE, agrees
-from ctxval.core.trial import Trial
+from ctxval.core.trial import Trial, Trials
 from ctxval.learning import ExecutionPrediction
 from ctxval.report.distance_model import distance_of
 from ctxval.report.markup import number, percent, quantity
@@ -71,8 +71,8 @@ def findings_of(context: ReportContext, questions: Mapping[str, Question]) -> li
 
 def executions(context: ReportContext) -> Answer | None:
     """Whether executions have no distance, or are open."""
-    trials, waiting = context.trials, context.trials.open.numbers
-    failed, unmeasured = trials.in_state("failed").numbers, trials.in_state("unmeasured").numbers
+    trials = Trials(context.trials)
+    failed, unmeasured, waiting = (trials.in_state(state).numbers for state in ("failed", "unmeasured", "open"))
     numbers = {"executions": context.executions, "failed": failed, "unmeasured": unmeasured, "open": waiting}
     if context.failed:
         text = f"{len(context.failed)} of {len(trials)} trials have no distance: nothing is known of d at their tasks."
