@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from ctxval import Campaign
-from ctxval.campaign.history import largest_distance
 from ctxval.certificates import DynamicsEvidence
 from ctxval.certificates.dynamics import bound_of
 from ctxval.certificates.dynamics_diagnostics import doubts, raised
+from ctxval.core.trial import Trials
 
 CONFIDENCE = 0.95
 FAILED = "a prediction that failed"
@@ -82,7 +82,7 @@ class JudgedRun:
             def judged(trials: Sequence[Any], *args: Any, **options: Any) -> DynamicsEvidence | None:
                 evidence: DynamicsEvidence | None = judge(trials, *args, **options)
                 if evidence is not None and not options.get("pending"):
-                    by = stopping(evidence, largest_distance(trials), self.threshold)
+                    by = stopping(evidence, Trials(trials).largest, self.threshold)
                     if by is not None:
                         steps[self.campaign.executions] = by
                 return evidence

@@ -27,7 +27,7 @@ from ctxval import (
     systems,
 )
 from ctxval.campaign.dynamics import NEAR, PREDICTION
-from ctxval.campaign.interval_search import IntervalSearch, next_task
+from ctxval.campaign.interval_search import IntervalSearch, NewTasks, next_task
 from ctxval.certificates import (
     AnytimeAudit,
     Audit,
@@ -376,7 +376,7 @@ def test_no_task_is_executed_a_second_time() -> None:
         assert np.abs(known - fresh).max(axis=1).min() > NEAR
         known = np.concatenate([known, fresh[None]])
     everywhere = np.stack(np.meshgrid(*[np.linspace(0, 1, 60)] * 2), axis=-1).reshape(-1, 2)
-    assert next_task(contested, everywhere, 0.2, 2.0, 0.95) is None
+    assert next_task(contested, everywhere, 0.2, 2.0, 0.95, NewTasks()) is None
 
 
 def test_a_task_is_new_by_the_parameters_that_change_predictions() -> None:
@@ -387,7 +387,7 @@ def test_a_task_is_new_by_the_parameters_that_change_predictions() -> None:
         return np.array([task[0], 0.123])
 
     def chosen(known: np.ndarray, spread: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> list[float]:
-        task = next_task(contested, known, 0.2, 2.0, 0.95, spread=spread, seen=seen)
+        task = next_task(contested, known, 0.2, 2.0, 0.95, NewTasks(spread=spread, seen=seen))
         assert task is not None
         return list(task.tolist())
 
@@ -419,7 +419,7 @@ def test_beside_a_failed_test_the_task_is_looked_for_that_it_would_make_worse() 
 
 
 def asked(found: DynamicsEvidence, known: np.ndarray, threshold: float, best: float = 0.2) -> list[float]:
-    point = next_task(found, known, best, threshold, 0.95)
+    point = next_task(found, known, best, threshold, 0.95, NewTasks())
     assert point is not None
     return list(point.tolist())
 

@@ -15,6 +15,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.checked import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Seconds, checked
 from ctxval._util.describe import describe
 from ctxval._util.progress import progress_shown, stage
+from ctxval._util.representation import call
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.dynamics import LearnedFromTrials
@@ -122,27 +123,27 @@ class Campaign:
     @property
     def completed(self) -> list[Trial]:
         """The trials with a distance."""
-        return [trial for trial in self.trials if trial.state == "completed"]
+        return list(self.recorder.trials.completed)
 
     @property
     def failed(self) -> list[Trial]:
         """The trials that failed."""
-        return [trial for trial in self.trials if trial.state == "failed"]
+        return list(self.recorder.trials.in_state("failed"))
 
     @property
     def unmeasured(self) -> list[Trial]:
         """The trials that were executed but have no distance, because it could not be measured."""
-        return [trial for trial in self.trials if trial.state == "unmeasured"]
+        return list(self.recorder.trials.in_state("unmeasured"))
 
     @property
     def executions(self) -> int:
         """The number of executions of S that have ended, with or without success."""
-        return self.recorder.executions
+        return self.recorder.trials.executions
 
     @property
     def worst(self) -> Trial | None:
         """The completed trial with the largest distance."""
-        return max(self.completed, key=lambda trial: trial.distance or 0.0, default=None)
+        return self.recorder.trials.worst
 
     def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
         """Return the trajectories of the model and of the system in a trial; None if a trajectory is not stored.
@@ -311,7 +312,7 @@ class Campaign:
         pool = worker_pool(self.validation.system, workers=workers, executor=executor, timeout=timeout)
         self.refresh()
         # Interrupted trials are executed again; these are open, because people are executing them.
-        waiting = [str(trial.number) for trial in self.trials if trial.state == "open" and not trial.attempts]
+        waiting = [str(trial.number) for trial in self.recorder.trials.open if not trial.attempts]
         if waiting:
             raise CertificateError(
                 f"trials are open: {', '.join(waiting)}. Record their results with `ctxval tell` (tell in Python) "
@@ -383,9 +384,8 @@ class Campaign:
             self.refresh()
             search = IntervalSearch(self.recorder, options, budget, threshold)
             self.state_threshold(threshold)
-            waiting = sum(trial.state == "open" for trial in self.trials)
             with self.recorder.predicting(search.predicts):
-                choice = search.choose() if self.executions + waiting < budget else None
+                choice = search.choose() if self.executions + len(self.recorder.trials.open) < budget else None
                 return None if choice is None else self.recorder.open(choice)
 
     def reopen(self, number: int, *, ended: bool = False) -> OpenTrial:
@@ -587,7 +587,7 @@ class Campaign:
         if not false_alarms < 1:
             raise InputError(f"false_alarms must be less than 1, such as 0.001, got {false_alarms:g}.")
         with progress_shown(progress):
-            return Watch(self, threshold, false_alarms, state)
+            return Watch(self.recorder, threshold, false_alarms, state)
 
     @checked
     def envelope(
@@ -640,12 +640,12 @@ class Campaign:
 
     def _distances(self) -> tuple[Array, Array]:
         """Return the points of the unit cube with a distance ``(n, d)``, and the distances ``(n,)``."""
-        completed = self.completed
-        points = np.array([trial.unit_point for trial in completed]).reshape(-1, self.validation.space.dimension)
-        return points, np.array([trial.distance for trial in completed], dtype=np.float64)
+        completed = self.recorder.trials.completed
+        return completed.points(self.validation.space.dimension), completed.distances
 
     def __repr__(self) -> str:
-        return display.as_text(self)
+        head = call(self, self.validation.space, name=self.name or None, seed=self.seed)
+        return display.as_text(head, self.search, self.recorder)
 
     def _repr_html_(self) -> str:
-        return display.as_html(self)
+        return display.as_html(self.name, self.seed, self.search, self.recorder)

@@ -6,65 +6,61 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ctxval._util.representation import Shown, call, counted, lines, named, number, shown, table
+from ctxval._util.representation import Shown, counted, lines, named, number, shown, table
+from ctxval.campaign.trials import TrialRecorder
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TASK, TaskSuite
-from ctxval.core.trial import Trial
+from ctxval.core.trial import Trial, Trials
 from ctxval.errors import InputError
+from ctxval.searches import Search
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from ctxval.campaign.campaign import Campaign
-
 _BEFORE, _AFTER = ("number", "origin", "state"), ("distance", "seconds", "attempts", "failure")
 
 
-def as_text(campaign: Campaign) -> str:
+def as_text(head: str, search: Search, recorder: TrialRecorder) -> str:
     """Return a campaign in five lines: the task space, the search, the number of trials, the worst task, the store."""
-    worst, at = campaign.worst, "no distance is known"
+    worst, at = recorder.trials.worst, "no distance is known"
     if worst is not None and worst.distance is not None:
-        where = named(worst.parameters, campaign.validation.space.units)
+        where = named(worst.parameters, recorder.validation.space.units)
         at = f"trial {worst.number} with distance {number(worst.distance)} at {where}"
     return lines(
-        call(campaign, campaign.validation.space, name=campaign.name or None, seed=campaign.seed),
-        f"search: {shown(campaign.search)}",
-        f"trials: {_trials(campaign)}",
+        head,
+        f"search: {shown(search)}",
+        f"trials: {_counts(recorder.trials)}",
         f"worst: {at}",
-        f"store: {shown(campaign.store)}",
+        f"store: {shown(recorder.store)}",
     )
 
 
-def as_html(campaign: Campaign) -> str:
+def as_html(name: str, seed: int, search: Search, recorder: TrialRecorder) -> str:
     """Return a campaign as an HTML table, with one row for each parameter of the worst task."""
-    worst, units = campaign.worst, campaign.validation.space.units
+    worst, units = recorder.trials.worst, recorder.validation.space.units
     parameters = {} if worst is None else worst.parameters
     return table(
-        f"Campaign {campaign.name}",
+        f"Campaign {name}",
         [
-            ("search", shown(campaign.search)),
-            ("seed", campaign.seed),
-            ("trials", _trials(campaign)),
+            ("search", shown(search)),
+            ("seed", seed),
+            ("trials", _counts(recorder.trials)),
             ("worst trial", "no distance is known" if worst is None else worst.number),
             ("distance", None if worst is None else worst.distance),
             *((name, f"{shown(value)} {units.get(name, '')}") for name, value in parameters.items()),
-            ("store", shown(campaign.store)),
+            ("store", shown(recorder.store)),
         ],
     )
 
 
-def _trials(campaign: Campaign) -> Shown:
-    states = Counter(trial.state for trial in campaign.trials)
-    counts = [counted(campaign.executions, "execution"), *(f"{count} {state}" for state, count in states.items())]
-    return Shown(f"{len(campaign.trials)} ({', '.join(counts)})")
+def _counts(trials: Trials) -> Shown:
+    states = Counter(trial.state for trial in trials)
+    counts = [counted(trials.executions, "execution"), *(f"{count} {state}" for state, count in states.items())]
+    return Shown(f"{len(trials)} ({', '.join(counts)})")
 
 
 def to_dataframe(trials: Sequence[Trial], space: TaskSpace) -> DataFrame:
-    """Return one row for each trial: number, origin, state, the task parameters, distance, seconds, attempts, failure.
-
-    A vector parameter has one column for each component, ``name[0], name[1], ...``. If a parameter has the name of
-    another column, such as ``distance``, its column is ``parameters.distance``. Unknown values are missing values.
-    """
+    """Return one row for each trial, as :meth:`ctxval.Campaign.to_dataframe` describes it."""
     try:
         from pandas import DataFrame
     except ImportError as error:

@@ -14,7 +14,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.latest import Latest
 from ctxval._util.progress import stage
 from ctxval._util.texts import parted, reason_of
-from ctxval.campaign.history import executed_trials, largest_distance, waiting_points
+from ctxval.campaign.history import at_points, executed_trials
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates.dynamics import bound_of, draws_for
 from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, failed, jumps
@@ -22,7 +22,7 @@ from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvi
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import REDEFINED, Trial
+from ctxval.core.trial import REDEFINED, Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
@@ -85,7 +85,7 @@ class CampaignDynamics:
             learned, failure = None, None
             try:
                 self._parts = self._parts or self.study.state_of_parts()
-                learned = self.study.learn([(trial.unit_point, trajectory) for trial, trajectory in executed], others)
+                learned = self.study.learn(at_points(executed), others)
             except Exception as error:  # users' parts
                 failure = reason_of(error)
             self._learned[key] = others, learned, failure
@@ -94,7 +94,7 @@ class CampaignDynamics:
 
     def regular(self, trials: Sequence[Trial]) -> LearnedDynamics | None:
         """Return what the regular transitions of the completed trials teach; None if there are no irregular ones."""
-        return self.study.regular([(trial.unit_point, known) for trial, known in executed_trials(self._store, trials)])
+        return self.study.regular(at_points(executed_trials(self._store, trials)))
 
     def prediction(self, trials: Sequence[Trial], *, pending: bool = False) -> Prediction | None:
         """Return the distance predicted from the executed trajectories, for a search; None if there is none.
@@ -103,8 +103,8 @@ class CampaignDynamics:
         still seen from what was executed.
         """
         learned = self.learned(trials)
-        executed = [(trial.unit_point, trajectory) for trial, trajectory in executed_trials(self._store, trials)]
-        prediction, waiting = self.study.prediction_of(learned, executed), waiting_points(trials)
+        executed, waiting = at_points(executed_trials(self._store, trials)), self._waiting(trials)
+        prediction = self.study.prediction_of(learned, executed)
         if prediction is None or not pending or not len(waiting):
             return prediction
         otherwise = prediction.otherwise
@@ -118,6 +118,9 @@ class CampaignDynamics:
             return None if other is None else replace(other, pending=Pending(waiting, lambda: other))
 
         return replace(prediction, otherwise=fallback, pending=Pending(waiting, after))
+
+    def _waiting(self, trials: Sequence[Trial]) -> Array:
+        return Trials(trials).open.points(self.study.validation.space.dimension)
 
     def _as_if(self, learned: LearnedDynamics, executed: Executed, waiting: Array) -> LearnedDynamics | None:
         try:
@@ -144,8 +147,7 @@ class CampaignDynamics:
             learned = self.learned(trials)
             few = learned is not None and len(learned.executed) < FEWEST
             if learned is not None and pending:
-                executed = [(trial.unit_point, known) for trial, known in executed_trials(self._store, trials)]
-                learned = self._as_if(learned, executed, waiting_points(trials))
+                learned = self._as_if(learned, at_points(executed_trials(self._store, trials)), self._waiting(trials))
             try:
                 worst = None if learned is None else learned.worst_of_mean if few else learned.screened
                 return None if learned is None or worst is None else self._evidence(learned, trials, worst)
@@ -189,7 +191,7 @@ class CampaignDynamics:
             groups=learned.drawn_from.functions_for(draws),
             without_model=learned.posterior.covariances.without_model,
         )
-        best = largest_distance(trials)
+        best = Trials(trials).largest
         bound = bound_of(evidence, best, confidence)
         if failed(evidence, bound) is not None:
             evidence = replace(evidence, suspect=learned.study.suspected_parameter(learned))
@@ -251,7 +253,7 @@ class CampaignDynamics:
 
     def checked(self, trials: Sequence[Trial]) -> tuple[CheckedPrediction, ...]:
         """Return the predictions of completed trials; of those without a stored one, of the last few that have any."""
-        completed = [trial for trial in trials if trial.state == "completed" and trial.distance is not None]
+        completed = Trials(trials).completed
         checked = []
         for place, trial in enumerate(completed):
             before = completed[:place]
@@ -261,7 +263,7 @@ class CampaignDynamics:
                 if not recent or self.learned(before, alone=True) is None:
                     continue
                 prediction = self.predict(before, trial.unit_point, alone=True)
-            known = np.array([earlier.unit_point for earlier in before]).reshape(-1, len(trial.unit_point))
+            known = Trials(before).points(len(trial.unit_point))
             how: dict[str, Any] = {
                 "stored": stored is not None,
                 "new": not len(known) or float(np.abs(known - trial.unit_point).max(axis=1).min()) > NEAR,
@@ -299,8 +301,7 @@ class LearnedFromTrials:
     def expected(self, points: Array, before: int) -> Array:
         """Return distances ``(m,)`` at points ``(m, d)`` predicted from trials with smaller numbers; NaN if unknown."""
         if before not in self._predictions:
-            earlier = [trial for trial in self.trials if trial.number < before]
-            self._predictions[before] = self.study.prediction(earlier)
+            self._predictions[before] = self.study.prediction([t for t in self.trials if t.number < before])
         prediction = self._predictions[before]
         return np.full(len(points), np.nan) if prediction is None else prediction.expected(points)[0]
 

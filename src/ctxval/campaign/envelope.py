@@ -15,17 +15,9 @@ from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.trials import TrialRecorder
+from ctxval.certificates import dynamics_diagnostics as diagnostics
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.dynamics import Dynamics, draws_for
-from ctxval.certificates.dynamics_diagnostics import (
-    NOISE,
-    POCKET,
-    fewest_executions,
-    is_explained,
-    missing_tests,
-    most_beyond,
-    untried_parameter,
-)
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.envelope import (
     DrawnDistances,
@@ -39,7 +31,7 @@ from ctxval.certificates.envelope import (
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.sample import without_success
-from ctxval.core.trial import Trial
+from ctxval.core.trial import Trial, Trials
 from ctxval.errors import InputError
 from ctxval.learning import LearnedDynamics
 
@@ -65,7 +57,7 @@ class EnvelopeSearch:
 
     def envelope(self) -> Envelope:
         """Return the envelope that the executions give, or why there is none. The system is never executed."""
-        space, trials = self._recorder.validation.space, self._ended()
+        space, trials = self._recorder.validation.space, self._recorder.trials.ended
         threshold, confidence = self._threshold, self._confidence
         unknown = next((trial for trial in without_success(trials) if trial.least <= threshold), None)
         if unknown is not None:
@@ -105,7 +97,7 @@ class EnvelopeSearch:
             if (doubt := doubt_of_envelope(evidence, threshold)) is not None:
                 return withdrawn(space, threshold, confidence, doubt)
             if failed:
-                predicted = learned.expected(np.array([trial.unit_point for trial in failed]))
+                predicted = learned.expected(Trials(failed).points(space.dimension))
                 for trial, distance in zip(failed, predicted.tolist(), strict=True):
                     if distance <= threshold:
                         doubt = f"trial {trial.number} failed beyond the threshold, and the learned dynamics keep it"
@@ -126,7 +118,7 @@ class EnvelopeSearch:
             except Exception:  # users' parts
                 self._split = numbers, None
         learned = self._split[1]
-        if learned is None or learned.posterior.noise > NOISE:
+        if learned is None or learned.posterior.noise > diagnostics.NOISE:
             return None
         without = learned.posterior.covariances.without_model
         return learned, replace(evidence, quantile=None, lags=0, noise=learned.posterior.noise, without_model=without)
@@ -136,7 +128,7 @@ class EnvelopeSearch:
 
         Nothing was predicted of a test whose run leaves what these have recorded.
         """
-        tests, most = [], most_beyond(evidence)
+        tests, most = [], diagnostics.most_beyond(evidence)
         for test in evidence.predictions:
             if not test.stored or test.origin not in DRAWN:
                 continue
@@ -157,7 +149,7 @@ class EnvelopeSearch:
 
         It is None if executions may differ by noise: then others may be needed to falsify the model.
         """
-        interval, trials, recorder = self._interval, self._ended(), self._recorder
+        interval, recorder, trials = self._interval, self._recorder, self._recorder.trials.ended
         if interval.best <= self._threshold or not interval.predicts or not recorder.has_tasks:
             return None
         known = self._known(trials)
@@ -172,7 +164,7 @@ class EnvelopeSearch:
         records. The larger of these two parts is worked on. Tests come last, when hardly anything is uncertain or the
         budget is just enough for them: those that are predicted by better dynamics raise k less.
         """
-        interval, recorder, trials = self._interval, self._recorder, self._ended()
+        interval, recorder, trials = self._interval, self._recorder, self._recorder.trials.ended
         if not interval.predicts or not recorder.has_tasks:
             return None
         if any(trial.least <= self._threshold for trial in without_success(trials)):
@@ -180,28 +172,28 @@ class EnvelopeSearch:
         known = self._known(trials)
         if known is None:
             return None
-        explained = all(is_explained(each, self._threshold) for each in known[1].predictions)
+        explained = all(diagnostics.is_explained(each, self._threshold) for each in known[1].predictions)
         regular = None if known[1].quantile is None and explained else self._regular(trials, known[1])
         learned, evidence = regular or known
-        missing = missing_tests(evidence.predictions, evidence.tests)
+        missing = diagnostics.missing_tests(evidence.predictions, evidence.tests)
         if missing and self._left <= missing:
             return interval.test()
-        if evidence.untried is not None and untried_parameter(evidence) is not None:
+        if evidence.untried is not None and diagnostics.untried_parameter(evidence) is not None:
             return Choice.tested(evidence.untried.task)
         pool, is_suite = learned.study.search.pool, recorder.validation.space.members is not None
         drawn = self._at(learned, pool if is_suite else pool[:_SCREENED], settled=False)
-        below, leaving = drawn.mean <= self._threshold, drawn.uncovered(most_beyond(evidence))
+        below, leaving = drawn.mean <= self._threshold, drawn.uncovered(diagnostics.most_beyond(evidence))
         # Within three spreads above the mean, a task is uncertain.
         straddle = 3.0 * drawn.spread(self._threshold) - np.abs(drawn.mean - self._threshold)  # Bryan et al. 2006
         uncertain, uncovered = below & (straddle > 0), below & (leaving > 1)
         if drawn.crossed is not None:  # executions of these tasks would not teach the regular part
             uncertain, uncovered = uncertain & (drawn.crossed <= 0), uncovered & (drawn.crossed <= 0)
             straddle = np.where(drawn.crossed <= 0, straddle, -np.inf)
-        few = evidence.executions < fewest_executions(evidence)
+        few = evidence.executions < diagnostics.fewest_executions(evidence)
         # Share of the tasks predicted below the threshold that may be uncertain or uncovered at the end.
         if few or (uncertain | uncovered).sum() > 0.03 * below.sum():
             score = straddle if uncertain.sum() >= uncovered.sum() else np.where(uncovered, leaving, -np.inf)
-            executed = np.array([trial.unit_point for trial in recorder.trials])
+            executed = recorder.trials.points(recorder.validation.space.dimension)
             away = np.abs(drawn.points[:, None] - executed).max(axis=2)
             new = (away > (0.0 if is_suite else NEAR)).all(axis=1)
             if (np.isfinite(score) & new).any():
@@ -213,10 +205,7 @@ class EnvelopeSearch:
     def _left(self) -> int:
         """The number of executions that the budget leaves."""
         recorder = self._recorder
-        return self._interval.budget - recorder.executions - sum(trial.state == "open" for trial in recorder.trials)
-
-    def _ended(self) -> list[Trial]:
-        return [trial for trial in self._recorder.trials if trial.state != "open"]
+        return self._interval.budget - recorder.trials.executions - len(recorder.trials.open)
 
     def _known(self, trials: Sequence[Trial]) -> tuple[LearnedDynamics, DynamicsEvidence] | None:
         """Return what the executions teach, and what they say of the predictions."""
@@ -247,14 +236,14 @@ class EnvelopeSearch:
     def _at(self, learned: LearnedDynamics, points: Array, *, settled: bool = True) -> DrawnDistances:
         draws = draws_for(self._confidence)
         values, beyond, away, crossed = learned.drawn_distances(points, draws, settled=settled)
-        return DrawnDistances(points, values, beyond, away / POCKET, crossed)
+        return DrawnDistances(points, values, beyond, away / diagnostics.POCKET, crossed)
 
 
 def has_tests(recorder: TrialRecorder, options: CertificateOptions) -> bool:
     """Return whether the tests of an envelope were executed, so that it is worth computing; nothing is learned."""
     if not isinstance(options.kind, Automatic | Dynamics) or not recorder.search.uses_prediction:
         return False
-    completed = [trial for trial in recorder.trials if trial.state == "completed"]
+    completed = recorder.trials.completed
     drawn = any(trial.origin in DRAWN for trial in completed)
     return drawn and _stored_tests(recorder, completed) >= options.kind.tests
 

@@ -64,11 +64,11 @@ class ExecutionLoop:
         recorder = self.recorder
         with recorder.store.sole_writer(), Interrupts() as interrupts, exits_as_exceptions():
             recorder.refresh()
-            if any(trial.state == "unmeasured" for trial in recorder.trials):
+            if recorder.trials.in_state("unmeasured"):
                 recorder.remeasure()
             total = self.expected if self.budget is None else self.budget
             try:
-                with stage("executions", total, done=recorder.executions):
+                with stage("executions", total, done=recorder.trials.executions):
                     with interrupts.shielded():
                         try:
                             # The heart of a campaign: choose and store, execute, measure and store.
@@ -88,7 +88,7 @@ class ExecutionLoop:
 
     def _next(self) -> Choice | Trial | None:
         """Return an interrupted trial, or the choice of a new one; None if there is nothing to execute at present."""
-        if self.budget is not None and self.recorder.executions + len(self.recorder.executing) >= self.budget:
+        if self.budget is not None and self.recorder.trials.executions + len(self.recorder.executing) >= self.budget:
             return None
         return self.recorder.interrupted or self.rule()
 

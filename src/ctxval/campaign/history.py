@@ -1,16 +1,14 @@
-"""The input of a search from stored trials: its history, the executed trajectories, and the points that wait."""
+"""The input of a search from stored trials: its history, and the executed trajectories."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from ctxval._util.arrays import Array
 from ctxval.campaign.storage.store import Store
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import Trial
+from ctxval.core.trial import Trial, Trials
 
 
 def history_of(trials: Sequence[Trial]) -> list[Trial]:
@@ -32,16 +30,11 @@ def history_of(trials: Sequence[Trial]) -> list[Trial]:
 
 def executed_trials(store: Store, trials: Sequence[Trial]) -> list[tuple[Trial, Trajectory]]:
     """Return the completed trials that have a trajectory of the system, with these trajectories."""
-    completed = [trial for trial in trials if trial.state == "completed"]
-    executed = store.trajectories([trial.number for trial in completed], "system")
+    completed = Trials(trials).completed
+    executed = store.trajectories(completed.numbers, "system")
     return [(trial, executed[trial.number]) for trial in completed if trial.number in executed]
 
 
-def largest_distance(trials: Sequence[Trial]) -> float:
-    """Return the largest distance of trials; 0 if none is known."""
-    return max((trial.distance or 0.0 for trial in trials), default=0.0)
-
-
-def waiting_points(trials: Sequence[Trial]) -> Array:
-    """Return the points of open trials, which are being executed, ``(k, d)``."""
-    return np.array([trial.unit_point for trial in trials if trial.state == "open"])
+def at_points(executed: Sequence[tuple[Trial, Trajectory]]) -> list[tuple[Array, Trajectory]]:
+    """Return executed trajectories with the points ``(d,)`` of their trials in the unit cube."""
+    return [(trial.unit_point, trajectory) for trial, trajectory in executed]

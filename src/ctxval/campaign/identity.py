@@ -15,7 +15,7 @@ from ctxval._util.texts import text_of
 from ctxval.campaign.storage.store import Store
 from ctxval.core.plan import least_distance
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import AT_LEAST, REDEFINED, TOLD_ALONE, Change, Trial
+from ctxval.core.trial import AT_LEAST, REDEFINED, TOLD_ALONE, Change, Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreMismatchError
 from ctxval.searches import DEFAULT, REGISTRY, Repeated, Search, by_name
@@ -88,8 +88,7 @@ def identify(
     differing = list(differences(stored, description))
     # The trials to recompute: the first, the worst and the last that has ended.
     ended = [trial for trial in trials if trial.executed or trial.state == "open"]
-    worst = max((t for t in ended if t.distance is not None), key=lambda t: t.distance or 0.0, default=None)
-    chosen = {t.number: t for t in (*ended[:1], *ended[-1:], *([] if worst is None else [worst]))}
+    chosen = {t.number: t for t in (*ended[:1], *ended[-1:], Trials(ended).worst) if t is not None}
     samples = [chosen[number] for number in sorted(chosen)]
 
     def refuse(difference: str, advice: str) -> NoReturn:

@@ -8,16 +8,15 @@ dynamics can be learned, if most predictions fail, or if it decides earlier, it 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
-from ctxval.campaign.history import largest_distance, waiting_points
 from ctxval.campaign.proposals import Steadiness, spread_tests
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule, Verdict
@@ -48,7 +47,7 @@ from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, MANY, TESTS
 from ctxval.certificates.sample import SAME
 from ctxval.certificates.verdict import counterexample, require_suite
-from ctxval.core.trial import Trial
+from ctxval.core.trial import Trial, Trials
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.worst_case import is_kinked
 
@@ -84,7 +83,7 @@ class IntervalSearch:
     @property
     def best(self) -> float:
         """The largest executed distance; 0 if none is known."""
-        return largest_distance(self.recorder.trials)
+        return self.recorder.trials.largest
 
     @property
     def tests(self) -> int:
@@ -115,27 +114,18 @@ class IntervalSearch:
 
     def choose(self) -> Choice | None:
         """Return the next task; None if the interval decides, or no task of a suite is left."""
-        kind = self.options.kind
+        trials = self.recorder.trials
         if not self.recorder.has_tasks:
             return None
-        if self.threshold is not None and any(trial.least > self.threshold for trial in self.recorder.trials):
-            if (repeated := self._against_noise()) is not None:
+        if self.threshold is not None and any(trial.least > self.threshold for trial in trials):
+            repeated = self._against_noise()
+            if repeated is not None or self.is_falsified:
                 return repeated
-            if self.is_falsified:
-                return None
-        if isinstance(kind, AnytimeAudit):
-            # The next independent draw of an anytime audit, which may end whenever its bound suffices.
-            if any(trial.origin == "iid" for trial in self._ended):
-                sample = replace(Sample.of(self._ended), threshold=self.limit)
-                certificate = kind.certify(sample, self.options.confidence)
-                if certificate.covers(self.limit, self.options.volume):
-                    return None
-            return Choice(self.recorder.draw(), "iid", planned_draws=0)
-        trials, dynamics = self.recorder.trials, self.recorder.dynamics
+        if isinstance(self.options.kind, AnytimeAudit):
+            return self._by_audit(self.options.kind)
         # The next test, if the last one held and more are missing: nothing needs to be searched for that.
-        ended = all(trial.state == "completed" for trial in trials)
-        if self.tests and self.predicts and ended and trials and trials[-1].origin in DRAWN:
-            predictions = dynamics.checked(trials)
+        if self.tests and self.predicts and trials and trials == trials.completed and trials[-1].origin in DRAWN:
+            predictions = self.recorder.dynamics.checked(trials)
             if predictions and held(predictions[-1], self.best) and missing_tests(predictions, self.tests):
                 return self.test()
         evidence = self._evidence()
@@ -145,33 +135,7 @@ class IntervalSearch:
         history = evidence is not None and (evidence.quantile is not None or evidence.lags > 0)
         if evidence is None or (self._fails(evidence) and not history):
             return self._by_distance()
-        # The whole evidence may decide if nothing that a few draws show leaves the verdict open.
-        bound, enough = self._bound(evidence), len(self._ended) >= FEWEST
-        decides = enough and raised(evidence, bound) <= self.limit and doubt_of(evidence, self.best, bound) is None
-        kept = dynamics.kept_evidence
-        if decides and evidence.pocket is None and kept(trials, self.options.confidence) is None:
-            learned = dynamics.learned(trials)
-            evidence = evidence if learned is None else replace(evidence, pocket=learned.pocket)
-            decides = unentered_pocket(evidence) is None
-        if decides:
-            whole = dynamics.evidence(trials, self.options.confidence, keep=self.keeps)
-            if whole is None:
-                return self._by_distance()
-            evidence = whole.needing(self.tests)
-            with suppress(CertificateError):
-                if certify_dynamics(Sample.of(self._ended), evidence, self.options.confidence).covers(self.limit):
-                    return None
-        if isinstance(kind, Automatic) and evidence.quantile is None and self._suite is None:
-            known = self._points(trials)
-            # Executions, besides tests, after which `auto` uses the posterior bound if the dynamics decide nothing.
-            chosen = sum(trial.origin not in DRAWN for trial in trials)
-            patient = chosen < 16 or self._lacks_tests_alone(evidence) or unentered_pocket(evidence) is not None
-            # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
-            if not patient or covering(known, kind.resolution, 0) is not None:
-                choice = self._by_distance()
-                if not patient or choice is None:
-                    return choice
-        return self._by_evidence(evidence)
+        return self._by_dynamics(evidence)
 
     def test(self) -> Choice:
         """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""
@@ -220,9 +184,9 @@ class IntervalSearch:
         tests = (test for test in reversed(evidence.predictions) if test.stored and test.origin in DRAWN)
         wrong = (test for test in tests if not held(test, self.best))
         failed = next((t for t in wrong if t.is_noisy or t.explained is None or not is_explained(t, bound)), None)
-        worst = next((trial.unit_point for trial in trials if trial.distance == self.best), None)
-        if failed is None or worst is None:
+        if failed is None or trials.worst is None:
             return None
+        worst = trials.worst.unit_point
         known, learned = self._points(trials), self.recorder.dynamics.learned(trials)
         unseen = [] if learned is None else learned.study.unseen_parameters
         for j in [*unseen, *(j for j in range(len(worst)) if j not in unseen)][:6]:
@@ -233,35 +197,72 @@ class IntervalSearch:
                 return task
         return None
 
+    def _by_audit(self, kind: AnytimeAudit) -> Choice | None:
+        """Return the next independent draw of an anytime audit, which may end whenever its bound suffices."""
+        ended = self.recorder.trials.ended
+        if any(trial.origin == "iid" for trial in ended):
+            certificate = kind.certify(replace(Sample.of(ended), threshold=self.limit), self.options.confidence)
+            if certificate.covers(self.limit, self.options.volume):
+                return None
+        return Choice(self.recorder.draw(), "iid", planned_draws=0)
+
     def _by_distance(self) -> Choice | None:
+        """Return the task that the posterior bound of the distance needs; None if it decides."""
         kind = self.options.kind
         # No distance is known, all are 0, or each task of a suite is executed.
         if not isinstance(kind, Automatic | Posterior) or not self.limit > 0 or self._suite is not None:
             return Choice(planned_draws=0)
         rule = StoppingRule(self.limit, self.options.confidence, kind.resolution)
-        now = rule.decide(self.recorder.trials, self.budget - self.recorder.executions)
+        now = rule.decide(self.recorder.trials, self.budget - self.recorder.trials.executions)
         if not now.decided:
             return Choice(now.next_point, "covering", planned_draws=0)
-        missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self._ended))
+        missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self.recorder.trials.ended))
         return self.test() if missing else None
 
+    def _by_dynamics(self, evidence: DynamicsEvidence) -> Choice | None:
+        """Return the task that the learned dynamics need, or that the posterior bound needs; None if one decides."""
+        kind, confidence = self.options.kind, self.options.confidence
+        dynamics, trials = self.recorder.dynamics, self.recorder.trials
+        # The whole evidence may decide if nothing that a few draws show leaves the verdict open.
+        bound, enough = self._bound(evidence), len(trials.ended) >= FEWEST
+        decides = enough and raised(evidence, bound) <= self.limit and doubt_of(evidence, self.best, bound) is None
+        if decides and evidence.pocket is None and dynamics.kept_evidence(trials, confidence) is None:
+            learned = dynamics.learned(trials)
+            evidence = evidence if learned is None else replace(evidence, pocket=learned.pocket)
+        if decides and unentered_pocket(evidence) is None:
+            whole = dynamics.evidence(trials, confidence, keep=self.keeps)
+            if whole is None:
+                return self._by_distance()
+            evidence = whole.needing(self.tests)
+            with suppress(CertificateError):
+                if certify_dynamics(Sample.of(trials.ended), evidence, confidence).covers(self.limit):
+                    return None
+        # For `auto`, the posterior bound of the distance is tried after many executions, besides tests, that decided
+        # nothing, and earlier if they cover the tasks, as they soon do in few dimensions.
+        lacks_tests = self._lacks_tests_alone(evidence)
+        if isinstance(kind, Automatic) and evidence.quantile is None and self._suite is None:
+            chosen = sum(trial.origin not in DRAWN for trial in trials)
+            patient = chosen < 16 or lacks_tests or unentered_pocket(evidence) is not None
+            if not patient:
+                return self._by_distance()
+            if covering(self._points(trials), kind.resolution, 0) is not None and self._by_distance() is None:
+                return None
+        return self.test() if lacks_tests else self._by_evidence(evidence)
+
     def _by_evidence(self, evidence: DynamicsEvidence) -> Choice:
-        """Return the task that the learned dynamics choose, or a test if nothing else is missing."""
-        best, limit, confidence, trials = self.best, self.limit, self.options.confidence, self.recorder.trials
-        if self._lacks_tests_alone(evidence):
-            return self.test()
+        """Return the task that the learned dynamics choose."""
+        best, limit, trials = self.best, self.limit, self.recorder.trials
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.study.planner, None if learned is None else learned.expected)
         # Failed ones count twice: without a reason, they are not repeated, although a start may jump next to them.
-        failed = [trial for trial in trials if trial.state == "failed"]
-        known, waiting = self._points([*self._ended, *failed]), waiting_points(trials)
+        failed = trials.in_state("failed")
+        known, waiting = self._points([*trials.ended, *failed]), self._points(trials.open)
+        new = NewTasks(self._near, steady)
         # Tasks that differ in parameters that change no prediction are one task, with values that are spread.
-        spread: Callable[[Array, Array], Array] | None = None
-        seen: Rows | slice = slice(None)
         if learned is not None and self._suite is None:
-            spread, seen = learned.spread_unseen, learned.study.seen_parameters
-        point = next_task(evidence, known, best, limit, confidence, steady, self._near, spread, seen)
-        if len(waiting) and (point is None or np.abs(waiting - point)[:, seen].max(axis=1).min() <= NEAR):
+            new = NewTasks(self._near, steady, learned.spread_unseen, learned.study.seen_parameters)
+        point = next_task(evidence, known, best, limit, self.options.confidence, new)
+        if len(waiting) and (point is None or np.abs(waiting - point)[:, new.seen].max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.
             if learned is not None:
                 expected = learned.expected(waiting)
@@ -269,7 +270,7 @@ class IntervalSearch:
                 limit = (1 + self.within) * best if self.threshold is None else limit
             after = self.recorder.dynamics.screening(trials, pending=True) or evidence
             known = self._points([*trials, *failed])
-            point = next_task(after, known, best, limit, confidence, steady, self._near, spread, seen)
+            point = next_task(after, known, best, limit, self.options.confidence, new)
         return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
     # What is known
@@ -303,12 +304,8 @@ class IntervalSearch:
     def _suite(self) -> Array | None:
         return self.recorder.validation.space.members
 
-    @property
-    def _ended(self) -> list[Trial]:
-        return [trial for trial in self.recorder.trials if trial.state != "open"]
-
-    def _points(self, trials: Sequence[Trial]) -> Array:
-        return np.array([trial.unit_point for trial in trials]).reshape(-1, self.recorder.validation.space.dimension)
+    def _points(self, trials: Iterable[Trial]) -> Array:
+        return Trials(trials).points(self.recorder.validation.space.dimension)
 
     @property
     def _near(self) -> float:
@@ -338,10 +335,9 @@ def require_decisive(options: CertificateOptions) -> None:
 
 def with_next_task(verdict: Verdict, recorder: TrialRecorder, options: CertificateOptions) -> Verdict:
     """Return a verdict; if it is undecided and learned dynamics choose the next task, with this task."""
-    failed = any(trial.state == "failed" for trial in recorder.trials)
-    if verdict.answer != "undecided" or failed or not is_decisive(options):
+    if verdict.answer != "undecided" or recorder.trials.in_state("failed") or not is_decisive(options):
         return verdict
-    search = IntervalSearch(recorder, options, recorder.executions + 1, verdict.threshold, keeps=False)
+    search = IntervalSearch(recorder, options, recorder.trials.executions + 1, verdict.threshold, keeps=False)
     evidence = search._evidence()
     choice = None if evidence is None or search._fails(evidence) else search.choose()
     if choice is None or choice.unit_point is None:
@@ -356,16 +352,35 @@ def with_next_task(verdict: Verdict, recorder: TrialRecorder, options: Certifica
     return replace(verdict, reason=reason, next_task=space.describe_point(point))
 
 
+@dataclass(frozen=True, eq=False)
+class NewTasks:
+    """Tells which tasks may be executed beside known ones."""
+
+    near: float = NEAR  #: the largest change of each coordinate to a task that is no new one
+    steady: Callable[[Array], bool] = lambda point: True  #: whether the distance of a task is that of its neighbours
+    #: moves a new task ``(d,)``, given the known ones ``(n, d)``; None if tasks are not moved
+    spread: Callable[[Array, Array], Array] | None = None
+    seen: Rows | slice = field(default_factory=lambda: slice(None))  #: coordinates in which a moved task must be new
+
+    def first(self, tasks: Array, known: Array, farthest: Array) -> Array | None:
+        """Return the first of tasks ``(m, d)`` that may be executed, as it is moved; None if there is none."""
+
+        def is_new(point: Array, by: Rows | slice = slice(None)) -> bool:
+            others, task = known[:, by], point[by]
+            close = others[np.abs(others - task).max(axis=1) <= self.near]
+            # A start may jump between tasks, so the closed loop next to an executed task may lead elsewhere.
+            most = 2 if np.array_equal(point, farthest) else 1
+            return len(close) < most and not (close == task).all(axis=1).any()
+
+        for task in filter(is_new, tasks):
+            moved = task if self.spread is None else self.spread(task, known)
+            if (moved is task or is_new(task, self.seen)) and self.steady(moved):
+                return moved
+        return None
+
+
 def next_task(
-    evidence: DynamicsEvidence,
-    known: Array,
-    best: float,
-    limit: float,
-    confidence: float,
-    steady: Callable[[Array], bool] = lambda point: True,
-    near: float = NEAR,
-    spread: Callable[[Array, Array], Array] | None = None,
-    seen: Rows | slice = slice(None),
+    evidence: DynamicsEvidence, known: Array, best: float, limit: float, confidence: float, new: NewTasks
 ) -> Array | None:
     """Return the task to execute next, a point ``(d,)``; None if all tasks lie next to executed ones.
 
@@ -375,9 +390,7 @@ def next_task(
     Further tasks test the predictions, and if all of these are known, the task that is farthest from all others does.
 
     The known tasks ``(n, d)`` are executed or open, ``best`` is the largest executed distance, and ``limit`` is what
-    the bound must not exceed. A task may be executed only if it is steady: its distance is that of its neighbours. It
-    is new if one of its coordinates differs by more than ``near`` from those of each known one. If ``spread`` moves a
-    task, given the known ones, the moved task is executed, and it must be new in the ``seen`` coordinates.
+    the bound must not exceed.
     """
     order = np.argsort(evidence.maxima, kind="stable")
     rank = evidence.rank(confidence)
@@ -403,20 +416,8 @@ def next_task(
     else:
         candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]
 
-    def is_new(point: Array, by: Rows | slice = slice(None)) -> bool:
-        others, task = known[:, by], point[by]
-        close = others[np.abs(others - task).max(axis=1) <= near]
-        # A start may jump between tasks, so the closed loop next to an executed task may lead elsewhere.
-        most = 2 if np.array_equal(point, evidence.coverage.task) else 1
-        return len(close) < most and not (close == task).all(axis=1).any()
-
     # Of random tasks, the one farthest from all known tasks comes first.
     others = np.random.default_rng(len(known)).random((256, known.shape[1]))
     away = np.abs(others[:, None] - known).max(axis=2).min(axis=1, initial=1.0)
     candidates.append(others[np.argsort(-away, kind="stable")])
-    for point in np.concatenate(candidates):
-        if is_new(point):
-            moved = point if spread is None else spread(point, known)
-            if (moved is point or is_new(point, seen)) and steady(moved):
-                return moved
-    return None
+    return new.first(np.concatenate(candidates), known, evidence.coverage.task)

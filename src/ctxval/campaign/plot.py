@@ -19,7 +19,7 @@ from ctxval._util.files import MADE_BY, written_whole
 from ctxval._util.representation import task_text
 from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import Trial
+from ctxval.core.trial import Trial, Trials
 from ctxval.errors import InputError
 
 if TYPE_CHECKING:
@@ -52,12 +52,11 @@ def convergence(campaign: Campaign, *, threshold: Limit = None, bound: Limit = N
 
     _worst(campaign)
     axes = _axes(ax)
-    numbers, distances = [trial.number for trial in campaign.completed], list(map(_known, campaign.completed))
-    last = len(campaign.trials) - 1
-    so_far = np.maximum.accumulate(distances)
-    axes.step([*numbers, last], [*so_far, so_far[-1]], where="post", color=_BLUE, linewidth=1.8, label="largest so far")
+    known, last = campaign.recorder.trials.completed, len(campaign.trials) - 1
+    so_far = np.maximum.accumulate(known.distances)
+    axes.step([*known.numbers, last], [*so_far, so_far[-1]], where="post", color=_BLUE, lw=1.8, label="largest so far")
     _draw_samples(axes, campaign, lambda trial: trial.number)
-    without = [trial.number for trial in campaign.trials if trial.state in ("failed", "unmeasured")]
+    without = campaign.recorder.trials.in_state("failed", "unmeasured").numbers
     if without:
         bottom = axes.get_xaxis_transform()
         axes.plot(without, [0.03] * len(without), "x", color=_ORANGE, transform=bottom, label="no distance is known")
@@ -91,8 +90,8 @@ def surrogate_slice(
     axes.plot(x, np.maximum(mean, 0.0), color=_BLUE, linewidth=1.8, label="GP mean")
     if space.dimension == 1:
         _draw_samples(axes, campaign, lambda trial: space.from_unit(trial.unit_point)[axis])
-    at, label = space.from_unit(worst.unit_point)[axis], "worst task executed"
-    axes.plot([at], [_known(worst)], "*", color=_ORANGE, markeredgecolor=_BLACK, markersize=14, label=label)
+    at, label = (space.from_unit(worst.unit_point)[axis], campaign.recorder.trials.largest), "worst task executed"
+    axes.plot(*at, "*", color=_ORANGE, markeredgecolor=_BLACK, markersize=14, label=label)
     axes.set_xlabel(space.labels[axis])
     return _finished(axes, campaign, threshold, bound)
 
@@ -117,9 +116,9 @@ def _draw_samples(axes: Axes, campaign: Campaign, place: Callable[[Trial], float
         ("acquired samples", ("acquisition",), _BLACK),
     )
     for label, origins, face in styles:
-        trials = [trial for trial in campaign.completed if trial.origin in origins]
+        trials = Trials(trial for trial in campaign.completed if trial.origin in origins)
         if trials:
-            x, y = [place(trial) for trial in trials], [_known(trial) for trial in trials]
+            x, y = [place(trial) for trial in trials], trials.distances
             axes.plot(x, y, "o", markersize=5, markerfacecolor=face, markeredgecolor=_BLACK, label=label)
 
 
@@ -134,7 +133,7 @@ def worst_trajectories(campaign: Campaign) -> Figure:
     reference = validation.task(space.parameters(space.from_unit(worst.unit_point))).reference
     states, inputs = map(labels_of, validation.names(model.states.shape[-1], model.inputs.shape[-1]))
     figure = trajectories(model, system, reference=reference, states=states, inputs=inputs)
-    distance = f"{_known(worst):.4g} {validation.labels.units}".rstrip()
+    distance = f"{campaign.recorder.trials.largest:.4g} {validation.labels.units}".rstrip()
     figure.suptitle(f"worst task executed: {task_text(worst.parameters)} (distance {distance})", fontsize=10)
     return figure
 
@@ -196,7 +195,3 @@ def _worst(campaign: Campaign) -> Trial:
     if campaign.worst is None:
         raise InputError("there is nothing to draw: no distance is known yet.")
     return campaign.worst
-
-
-def _known(trial: Trial) -> float:
-    return float("nan") if trial.distance is None else trial.distance

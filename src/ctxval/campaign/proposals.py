@@ -24,11 +24,10 @@ from ctxval._util.texts import enumerated, shortened
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.costs import costs_of
 from ctxval.campaign.dynamics import PREDICTION, CampaignDynamics
-from ctxval.campaign.history import waiting_points
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates.prediction_tests import TESTS
 from ctxval.core.rollout import rollout
-from ctxval.core.trial import CONVERGED, UNSTEADY, Trial
+from ctxval.core.trial import CONVERGED, UNSTEADY, Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
 from ctxval.learning.closed_loops import LoopPlanner
@@ -142,7 +141,7 @@ class Proposals:
         Guesses of a search that knows nothing are random; far apart, and mostly with parameters at their bounds, they
         teach more. The first task is that of the search, also if others follow at once.
         """
-        known, waiting = any(trial.distance is not None for trial in trials), waiting_points(trials)
+        known, waiting = Trials(trials).completed, Trials(trials).open.points(self._validation.space.dimension)
         if (
             known
             or not len(waiting)
@@ -242,8 +241,7 @@ class IndependentDraws:
 
 def remaining_tasks(validation: Validation, trials: Sequence[Trial]) -> Array | None:
     """Return the tasks of a suite that no trial has, points ``(r, d)``; None if tasks fill the box."""
-    known = np.array([trial.unit_point for trial in trials]).reshape(-1, validation.space.dimension)
-    return validation.space.remaining(known)
+    return validation.space.remaining(Trials(trials).points(validation.space.dimension))
 
 
 def spread_tests(trials: Sequence[Trial]) -> int:

@@ -26,7 +26,7 @@ from ctxval.core.controller import converged_of
 from ctxval.core.distance import Distance
 from ctxval.core.plan import Plan, require_repeatable, try_distance
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import CONVERGED, Origin, Trial
+from ctxval.core.trial import CONVERGED, Origin, Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError, CtxvalError, DistanceError, InputError, StoreAccessError, StoreError
 from ctxval.models import Refined
@@ -59,19 +59,14 @@ class TrialRecorder:
     # Present state
 
     @property
-    def trials(self) -> tuple[Trial, ...]:
+    def trials(self) -> Trials:
         """All trials in the order of asking."""
-        return tuple(self._trials)
-
-    @property
-    def executions(self) -> int:
-        """The number of executions of S that have ended, with or without success."""
-        return sum(trial.executed for trial in self._trials)
+        return Trials(self._trials)
 
     @property
     def interrupted(self) -> Trial | None:
         """The first trial whose execution was interrupted."""
-        begun = (trial for trial in self._trials if trial.state == "open" and trial.attempts)
+        begun = (trial for trial in self.trials.open if trial.attempts)
         return next((trial for trial in begun if trial.number not in self.executing), None)
 
     @property
@@ -119,12 +114,12 @@ class TrialRecorder:
             self.search.remember([trial.note for trial in history])
 
     def _tell_search(self, trials: Sequence[Trial]) -> None:
-        values = [np.nan if trial.distance is None else trial.distance for trial in trials]
-        self.search.tell(np.array([trial.unit_point for trial in trials]), values)
+        told = Trials(trials)
+        self.search.tell(told.points(self.validation.space.dimension), told.distances.tolist())
 
     def refresh(self) -> None:
         """Read the trials again if other processes have changed the store."""
-        known = (len(self._trials), sum(trial.state == "open" for trial in self._trials), self._changes)
+        known = (len(self._trials), len(self.trials.open), self._changes)
         stored = self.store.signature()
         if stored[2] != self._changes:
             identify(self.store, self.validation, self.description, None, False)

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ctxval._util.checked import require
 from ctxval._util.progress import advance, stage
 from ctxval.campaign.choices import Execution
-from ctxval.campaign.history import executed_trials
+from ctxval.campaign.history import at_points, executed_trials
+from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates.expiry import EXCEEDED, FEWEST, Statistic, WatchedChannel, WatchState
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.run_statistics import DISTANCE, RunStatistics, names
-
-if TYPE_CHECKING:
-    from ctxval.campaign.campaign import Campaign
 
 FALSE_ALARMS = 1e-3  #: usual rate of false alarms: one in 1,000 executions
 _MOST = 24  # certified executions that are predicted from the others, the latest ones: each is learned from anew
@@ -39,16 +37,16 @@ class Watch:
     """
 
     def __init__(
-        self, campaign: Campaign, threshold: float, false_alarms: float, state: WatchState | None = None
+        self, recorder: TrialRecorder, threshold: float, false_alarms: float, state: WatchState | None = None
     ) -> None:
-        self.campaign, dynamics = campaign, campaign.recorder.dynamics
-        executed = executed_trials(campaign.store, campaign.trials)
+        self._recorder, dynamics = recorder, recorder.dynamics
+        executed = executed_trials(recorder.store, recorder.trials)
         self._trials = [trial for trial, _ in executed]
-        self._executed = [(trial.unit_point, trajectory) for trial, trajectory in executed]
+        self._executed = at_points(executed)
         if len(executed) < FEWEST:
             needs = f"at least {FEWEST} executions with trajectories in the store, got {len(executed)}"
             raise CertificateError(f"a watch needs {needs}.")
-        learned = dynamics.learned(campaign.trials, alone=True)
+        learned = dynamics.learned(recorder.trials, alone=True)
         if learned is None:
             why = dynamics.failure or "the model explains them all, or they cannot be predicted"
             raise CertificateError(f"nothing can be learned from the executions in the store: {why}.")
@@ -106,7 +104,7 @@ class Watch:
         """
         require("run", Trajectory | Execution, run)
         execution = Execution(run) if isinstance(run, Trajectory) else run
-        trajectory, distance, validation = execution.trajectory, execution.distance, self.campaign.validation
+        trajectory, distance, validation = execution.trajectory, execution.distance, self._recorder.validation
         if trajectory is None:
             advice = "a distance or a failure alone says nothing"
             raise InputError(f"a watch needs the trajectory of an execution; {advice}.")
@@ -153,10 +151,10 @@ class Watch:
 
     def _require_states(self, trajectory: Trajectory) -> None:
         """Refuse a recording without a task that cannot be compared with predictions."""
-        learned = self._statistics.learned
-        if learned.study.given.physical or self.campaign.validation.outputs is not None:
+        learned, validation = self._statistics.learned, self._recorder.validation
+        if learned.study.given.physical or validation.outputs is not None:
             raise InputError(
-                f"a recording needs the parameters of its task, {', '.join(self.campaign.validation.space.names)}: the "
+                f"a recording needs the parameters of its task, {', '.join(validation.space.names)}: the "
                 "learned dynamics depend on a task parameter, or only outputs are recorded. On the command line, give "
                 "--set NAME=VALUE for one recording, or a table of recordings with a column for each parameter."
             )

@@ -22,7 +22,7 @@ from ctxval.certificates.options import CONFIDENCE, Confidence
 from ctxval.certificates.posterior import Posterior, instantaneous_bound
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.verdict import counterexample
-from ctxval.core.trial import Trial
+from ctxval.core.trial import Trial, Trials
 from ctxval.errors import CertificateError
 
 
@@ -59,7 +59,7 @@ class StoppingRule(ShortRepr):
         if counterexample(trials, self.threshold) is not None:
             return StoppingDecision(decided=True)
         try:
-            sample, points = _ended(trials), np.array([trial.unit_point for trial in trials])
+            sample, points = Sample.of(Trials(trials).ended), np.array([trial.unit_point for trial in trials])
             missing = covering(points, self.resolution, left)
             if missing is None or self._is_surely_too_high(sample):
                 return StoppingDecision()
@@ -83,7 +83,7 @@ class StoppingRule(ShortRepr):
         if not trials or covering(points, self.resolution, 0) is None:
             return False
         with suppress(CertificateError):
-            return self._is_kept(_ended(trials))[1]
+            return self._is_kept(Sample.of(Trials(trials).ended))[1]
         return False
 
     def _is_kept(self, sample: Sample) -> tuple[Maxima, bool]:
@@ -101,7 +101,3 @@ class StoppingRule(ShortRepr):
             draw_maxima(sample, draws=draws).probability(self.threshold) < self.confidence - margin
             for draws, margin in _SCREENINGS
         )
-
-
-def _ended(trials: Sequence[Trial]) -> Sample:
-    return Sample.of([trial for trial in trials if trial.state != "open"])

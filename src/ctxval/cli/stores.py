@@ -23,6 +23,7 @@ from ctxval.cli.base import Allowed, command, named_values, out, print_table
 from ctxval.cli.config.settings import ExperimentSettings
 from ctxval.cli.config.stored_settings import budget_of, limit_of, open_store, planned_settings, trusted_settings
 from ctxval.core.labels import Labels, labels_of
+from ctxval.core.trial import Trials
 from ctxval.errors import CtxvalError, InputError, StoreAccessError, StoreError
 
 
@@ -30,7 +31,7 @@ from ctxval.errors import CtxvalError, InputError, StoreAccessError, StoreError
 def status(store: Path) -> Any:
     opened = Store.existing(store)
     with opened.snapshot():
-        description, trials, changes = opened.description(), opened.trials(), opened.history()
+        description, trials, changes = opened.description(), Trials(opened.trials()), opened.history()
         thresholds = [asdict(stated) for stated in opened.thresholds() or ()]
         kept = opened.computed(base.RUN)
     verdict = None
@@ -39,19 +40,16 @@ def status(store: Path) -> Any:
             verdict = f"{answer} against {threshold:g}: {reason}"
     search = description.get("search")
     search = search.get("type") if isinstance(search, dict) else None
-    states = ("failed", "unmeasured", "open")
-    numbers = {state: [trial.number for trial in trials if trial.state == state] for state in states}
-    measured = [trial for trial in trials if trial.distance is not None]
-    worst = base.worst_of(max(measured, key=lambda trial: trial.distance or 0, default=None))
+    worst = base.worst_of(trials.worst)
     report: dict[str, Any] = {
         "case": description.get("name"),
         "search": search,
         "seed": description.get("seed"),
-        "executions": sum(trial.executed for trial in trials),
-        "failed": len(numbers["failed"]),
+        "executions": trials.executions,
+        "failed": len(trials.in_state("failed")),
         "failures": base.failures_of(trials),
-        "unmeasured": numbers["unmeasured"],
-        "open": numbers["open"],
+        "unmeasured": trials.in_state("unmeasured").numbers,
+        "open": trials.open.numbers,
         "worst": worst,
         "verdict": verdict,
         "thresholds": thresholds,
@@ -90,7 +88,7 @@ def remeasure(store: Path, allowed: Allowed) -> Any:
     before = {trial.number: trial.distance for trial in Store.existing(store).trials()}
     campaign = open_store(store, allowed, remeasure=True).campaign
     trials, worst = campaign.trials, base.worst_of(campaign.worst)
-    measured = sum(trial.state == "completed" for trial in trials)
+    measured = len(campaign.completed)
     changed = [trial.number for trial in trials if trial.distance != before.get(trial.number)]
     unmeasured = [trial.number for trial in campaign.unmeasured]
     if changed:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr, call, counted, line, lines, table
 from ctxval.core.space import Point
@@ -72,6 +74,60 @@ class Trial:
         names = ("origin", "state", "distance", "failure", "seconds", "attempts", "because")
         known = ((name, getattr(self, name)) for name in names)
         return table(f"Trial {self.number}", [*known, *self.parameters.items()])
+
+
+class Trials(tuple[Trial, ...]):
+    """Trials in the order of asking."""
+
+    __slots__ = ()
+
+    def in_state(self, *states: State) -> Trials:
+        """Return the trials in one of these states."""
+        return Trials(trial for trial in self if trial.state in states)
+
+    @property
+    def open(self) -> Trials:
+        """The trials that are being executed, or wait for it."""
+        return self.in_state("open")
+
+    @property
+    def ended(self) -> Trials:
+        """The trials that are not open."""
+        return self.in_state("completed", "failed", "unmeasured")
+
+    @property
+    def completed(self) -> Trials:
+        """The trials with a distance."""
+        return self.in_state("completed")
+
+    @property
+    def executions(self) -> int:
+        """The number of executions of S that have ended, with or without success."""
+        return sum(trial.executed for trial in self)
+
+    @property
+    def worst(self) -> Trial | None:
+        """The first trial with the largest distance; None if no distance is known."""
+        return max(self.completed, key=lambda trial: trial.distance or 0.0, default=None)
+
+    @property
+    def largest(self) -> float:
+        """The largest distance; 0 if none is known."""
+        return max((trial.distance or 0.0 for trial in self), default=0.0)
+
+    @property
+    def numbers(self) -> list[int]:
+        """The numbers of the trials."""
+        return [trial.number for trial in self]
+
+    @property
+    def distances(self) -> Array:
+        """The distances ``(n,)``; NaN if a distance is not known."""
+        return np.array([np.nan if trial.distance is None else trial.distance for trial in self])
+
+    def points(self, dimension: int) -> Array:
+        """Return the tasks as points of the unit cube ``(n, d)``."""
+        return np.array([trial.unit_point for trial in self]).reshape(-1, dimension)
 
 
 def designs_sentence(trials: Sequence[Trial]) -> str | None:

@@ -24,7 +24,7 @@ from ctxval.core.labels import Labels, labels_of
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TASK, TaskSuite
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import Trial, designs_sentence
+from ctxval.core.trial import Trial, Trials, designs_sentence
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.replays import Replay, replay_executed
@@ -88,19 +88,19 @@ class ReportContext(ShortRepr):
     # Trials
 
     @functools.cached_property
-    def completed(self) -> tuple[Trial, ...]:
+    def completed(self) -> Trials:
         """The trials with a distance."""
-        return tuple(trial for trial in self.trials if trial.distance is not None)
+        return Trials(self.trials).completed
 
     @functools.cached_property
-    def failed(self) -> tuple[Trial, ...]:
+    def failed(self) -> Trials:
         """The trials that failed or could not be measured."""
-        return tuple(trial for trial in self.trials if trial.state in ("failed", "unmeasured"))
+        return Trials(self.trials).in_state("failed", "unmeasured")
 
     @property
     def executions(self) -> int:
         """The number of executions of S that have ended."""
-        return sum(trial.executed for trial in self.trials)
+        return Trials(self.trials).executions
 
     @functools.cached_property
     def worst_first(self) -> tuple[Trial, ...]:
@@ -124,12 +124,12 @@ class ReportContext(ShortRepr):
     @functools.cached_property
     def points(self) -> Array:
         """The points of the unit cube with a distance ``(n, d)``."""
-        return self._unit_points(self.completed)
+        return self.completed.points(self.space.dimension)
 
     @functools.cached_property
     def distances(self) -> Array:
         """The distances ``(n,)`` of these points."""
-        return np.array(list(map(distance_of, self.completed)))
+        return self.completed.distances
 
     @property
     def suite(self) -> TaskSuite | None:
@@ -150,10 +150,7 @@ class ReportContext(ShortRepr):
 
     def coordinates(self, trials: Sequence[Trial]) -> Array:
         """Return the tasks of trials in the units of the parameters, ``(n, d)``."""
-        return self.space.from_unit(self._unit_points(trials))
-
-    def _unit_points(self, trials: Sequence[Trial]) -> Array:
-        return np.array([trial.unit_point for trial in trials]).reshape(-1, self.space.dimension)
+        return self.space.from_unit(Trials(trials).points(self.space.dimension))
 
     # The verdict
 

@@ -20,7 +20,7 @@ from ctxval.certificates import RESOLUTION
 from ctxval.certificates.bounds import at_most, of_tasks
 from ctxval.certificates.covering import bare_corners, farthest_task
 from ctxval.certificates.dynamics_diagnostics import ACCURATE, agrees
-from ctxval.core.trial import Trial
+from ctxval.core.trial import Trial, Trials
 from ctxval.learning import ExecutionPrediction
 from ctxval.report.distance_model import distance_of
 from ctxval.report.markup import number, percent, quantity
@@ -71,16 +71,15 @@ def findings_of(context: ReportContext, questions: Mapping[str, Question]) -> li
 
 def executions(context: ReportContext) -> Answer | None:
     """Whether executions have no distance, or are open."""
-    states = ("failed", "unmeasured", "open")
-    listed = {state: [trial.number for trial in context.trials if trial.state == state] for state in states}
-    numbers = {"executions": context.executions, **listed}
-    without = len(listed["failed"]) + len(listed["unmeasured"])
-    if without:
-        text = f"{without} of {len(context.trials)} trials have no distance: nothing is known of d at their tasks."
+    trials = Trials(context.trials)
+    failed, unmeasured, waiting = (trials.in_state(state).numbers for state in ("failed", "unmeasured", "open"))
+    numbers = {"executions": context.executions, "failed": failed, "unmeasured": unmeasured, "open": waiting}
+    if context.failed:
+        text = f"{len(context.failed)} of {len(trials)} trials have no distance: nothing is known of d at their tasks."
         return "bad", text, numbers
-    if listed["open"]:
-        waiting = ", ".join(map(str, listed["open"]))
-        return "attention", f"Trials are open and wait for their results: {waiting}.", numbers
+    if waiting:
+        text = f"Trials are open and wait for their results: {', '.join(map(str, waiting))}."
+        return "attention", text, numbers
     return None if context.executions else ("unknown", "Nothing was executed.", numbers)
 
 

@@ -156,7 +156,7 @@ def to_json(context: ReportContext) -> dict[str, Any]:
             **({} if verdict is None else verdict.to_json()),
             "units": context.labels.units,
             "executions": context.executions,
-            "failed": [trial.number for trial in context.failed],
+            "failed": context.failed.numbers,
             "certificate": None if certificate is None else certificate.to_json(),
             "envelope": None if context.envelope is None else context.envelope.to_json(),
             "missing": context.missing or None,

@@ -28,6 +28,7 @@ from ctxval.core.distance import Distance
 from ctxval.core.plan import Plan
 from ctxval.core.soundness import Flips, InputSaturation, aimed_states, flips, saturation
 from ctxval.core.task import Task
+from ctxval.core.trial import Trials
 from ctxval.core.validation import Validation
 from ctxval.distances import GoalError, MeanDeviation, StateNorm, TrackingError
 from ctxval.errors import CtxvalError, DesignError, InputError, ModelError
@@ -185,8 +186,8 @@ def _report(campaign: Campaign, distance: Distance, threshold: float | None, see
         # The upper bound of Clopper and Pearson (1934).
         share = volume_bound(len(drawn), missed, 1 - CONFIDENCE) if missed < len(drawn) else 1.0
     ordered = sorted(campaign.trials, key=lambda trial: -np.inf if trial.distance is None else -trial.distance)
-    done = np.array([trial.unit_point for trial in ordered if trial.distance is not None])
-    points = _with_neighbours(done.reshape(-1, validation.space.dimension), np.random.default_rng([seed, 1]))
+    done = Trials(ordered).completed.points(validation.space.dimension)
+    points = _with_neighbours(done, np.random.default_rng([seed, 1]))
     plans = _planned(validation, points)
     inputs, rows = [plan.model_trajectory.inputs for plan in plans.values()], list(plans)
     flipped = flips(points[rows], inputs) if len(rows) > 1 else None

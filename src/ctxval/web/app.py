@@ -182,7 +182,7 @@ class OperatorPage(PageRoutes):
                 sentence, status = f"a result of this trial is recorded already: {ended}.", 409
         # The problem is shown in its form, or at the top of the page if the form is not on it any more.
         snapshot = self.service.snapshot
-        shown = [trial for trial in snapshot.trials if trial.told] if "replace" in fields else snapshot.waiting
+        shown = [trial for trial in snapshot.trials if trial.told] if "replace" in fields else snapshot.trials.open
         where = f"{kind}-{number}" if any(trial.number == number for trial in shown) else "trial"
         return await self._campaign(request, session, Problem(where, sentence, fields, status))
 

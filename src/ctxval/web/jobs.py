@@ -23,7 +23,7 @@ from ctxval.certificates import CertificateOptions, Verdict
 from ctxval.certificates import judge as judge_trials
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of
-from ctxval.core.trial import Trial
+from ctxval.core.trial import Trials
 from ctxval.errors import InputError
 
 Files = dict[str, bytes]  #: the files of a trial by name
@@ -35,32 +35,19 @@ Pictures = dict[str, bytes | str]  #: pictures by name as SVG; a text says why a
 class Snapshot:
     """The trials of the store at one moment, the number of its changes, and the tasks of the open trials by number."""
 
-    trials: tuple[Trial, ...]
+    trials: Trials
     changes: int = 0
     tasks: dict[int, dict[str, Any]] = field(default_factory=dict)
 
     @property
-    def waiting(self) -> list[Trial]:
-        return [trial for trial in self.trials if trial.state == "open"]
-
-    @property
     def signature(self) -> tuple[int, int, int]:
         """That of the store, which shows whether it has changed."""
-        return len(self.trials), len(self.waiting), self.changes
+        return len(self.trials), len(self.trials.open), self.changes
 
     @property
     def ended(self) -> tuple[int, int]:
         """Identifies the trials that have ended, which are those that a verdict is about."""
-        return len(self.trials) - len(self.waiting), self.changes
-
-    @property
-    def executions(self) -> int:
-        return sum(trial.executed for trial in self.trials)
-
-    @property
-    def worst(self) -> Trial | None:
-        known = (trial for trial in self.trials if trial.state == "completed")
-        return max(known, key=lambda trial: trial.distance or 0.0, default=None)
+        return len(self.trials.ended), self.changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,14 +76,14 @@ class ServedCampaign:
         """Read the trials in the store, with what people must know of the open tasks before they execute them."""
         self.campaign.refresh()
         validation, tasks = self.campaign.validation, dict[int, dict[str, Any]]()
-        for trial in (trial for trial in self.campaign.trials if trial.state == "open"):
+        for trial in self.campaign.recorder.trials.open:
             task = validation.task_at(validation.space.parameters(validation.space.point(trial.parameters)))
             start = np.atleast_1d(validation.recorded_task(task).initial_state).tolist()
             labels = labels_of(self.experiment.names(len(start), 0)[0])
             starts = list(zip(labels, start, strict=True))
             tasks[trial.number] = {"start": starts, "horizon": task.horizon, "dt": task.dt}
         # The trials were read after this process's last change, so their counts are those of the signature.
-        return Snapshot(self.campaign.trials, self.campaign.store.signature()[2], tasks)
+        return Snapshot(self.campaign.recorder.trials, self.campaign.store.signature()[2], tasks)
 
 
 OpenCampaign = Callable[[], ServedCampaign]

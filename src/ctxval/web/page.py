@@ -75,7 +75,7 @@ class Page:
             units=self._units,
             work=state,
             snapshot=snapshot,
-            opened=[self._open_trial(trial) for trial in snapshot.waiting],
+            opened=[self._open_trial(trial) for trial in snapshot.trials.open],
             enough=self._enough(),
             shown=shown[::-1],
             parameters=list(zip(space.labels, space.low, space.high, strict=True)),
@@ -114,13 +114,13 @@ class Page:
     def _enough(self) -> str | None:
         """Return why no further task is needed for the verdict; None if one may be."""
         state, budget = self._state, self._served.budget
-        if not self._served.decides or state.snapshot.waiting or state.choosing is not None:
+        if not self._served.decides or state.snapshot.trials.open or state.choosing is not None:
             return None
         if state.judged == state.snapshot.ended and state.verdict is not None and state.verdict.answer != "undecided":
             return f"The verdict is reached: {state.verdict.answer}. No further execution is needed for it."
         if not state.enough:
             return None
-        if state.snapshot.executions >= budget:
+        if state.snapshot.trials.executions >= budget:
             return f"The budget of {counted(budget, 'execution')} is spent."
         if state.verdict is not None and state.verdict.answer == "undecided":
             return "No other execution would decide the verdict; its reason says what is missing."

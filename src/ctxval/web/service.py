@@ -165,7 +165,7 @@ class CampaignService(PageState):
 
     def _follow(self) -> None:
         """Prepare the files of open trials, forget those of others, and judge the trials that have ended."""
-        waiting = {trial.number for trial in self.snapshot.waiting if not trial.attempts}
+        waiting = {trial.number for trial in self.snapshot.trials.open if not trial.attempts}
         self.files = {number: kept for number, kept in self.files.items() if number in waiting}
         for number in waiting - set(self.files) - set(self._preparing):
             self._preparing[number] = self._spawn(self._prepare(number))
@@ -181,7 +181,7 @@ class CampaignService(PageState):
             files = str(error)
         finally:
             self._preparing.pop(number, None)
-        if any(trial.number == number for trial in self.snapshot.waiting):
+        if any(trial.number == number for trial in self.snapshot.trials.open):
             self.update(files={**self.files, number: files})
 
     async def _evaluate(self) -> None:

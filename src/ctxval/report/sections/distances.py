@@ -231,7 +231,7 @@ def distances_in_order(context: ReportContext) -> Chart | None:
     """Return the distance of each trial and the largest one so far, with the limits; None if no distance is known."""
     if not context.completed:
         return None
-    numbers = np.array([trial.number for trial in context.completed], dtype=np.float64)
+    numbers = np.array(context.completed.numbers, dtype=np.float64)
     so_far = np.maximum.accumulate(context.distances)
     last = float(max(trial.number for trial in context.trials))
     x = Axis("trial", -0.02 * max(last, 1.0), 1.02 * max(last, 1.0), whole=True)
@@ -248,7 +248,7 @@ def distances_in_order(context: ReportContext) -> Chart | None:
     chart.marks(numbers, context.distances, "sample", "executed", names)
     if context.failed:
         bottom = np.full(len(context.failed), 0.03 * chart.y.ends[1])
-        chart.marks([trial.number for trial in context.failed], bottom, "failed", "no distance is known")
+        chart.marks(context.failed.numbers, bottom, "failed", "no distance is known")
     return chart
 
 

@@ -12,7 +12,7 @@ from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.progress import advance, stage
 from ctxval._util.representation import ShortRepr
 from ctxval.campaign.campaign import Campaign
-from ctxval.campaign.history import executed_trials
+from ctxval.campaign.history import at_points, executed_trials
 from ctxval.core.plan import Plan
 from ctxval.core.system import System, WithOutputs
 from ctxval.core.trajectory import Trajectory
@@ -169,7 +169,7 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
             f"causes need at least 2 executions with trajectories in the store, got {len(trials)}; `ctxval run` with "
             "--envelope goes on after the model is falsified."
         )
-    executed = [(trial.unit_point, run) for trial, run in trials]
+    executed = at_points(trials)
     with single_threaded():
         states = [run for _, run in executed]
         if validation.outputs is not None:

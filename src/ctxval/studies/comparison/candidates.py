@@ -17,7 +17,7 @@ from ctxval._util.progress import stage
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import Choice, Execution
 from ctxval.campaign.execution import ExecutionLoop
-from ctxval.campaign.history import executed_trials, largest_distance
+from ctxval.campaign.history import executed_trials
 from ctxval.core.plan import gives_inputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
@@ -95,7 +95,7 @@ class Candidate:
     @property
     def largest(self) -> float:
         """The largest executed distance; 0 if there is none."""
-        return largest_distance(self.recorder.trials)
+        return self.recorder.trials.largest
 
     def executed(self, *, shared: bool = False) -> list[Trial]:
         """Return the trials whose execution has ended, with or without success: its own, or those of others."""

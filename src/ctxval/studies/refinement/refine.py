@@ -16,7 +16,7 @@ from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.checked import PositiveFloat, PositiveInt, checked
 from ctxval._util.progress import progress_shown, stage
 from ctxval.campaign.campaign import Campaign
-from ctxval.campaign.history import executed_trials
+from ctxval.campaign.history import at_points, executed_trials
 from ctxval.certificates import CertificateOptions
 from ctxval.certificates.verdict import Verdict, counterexample
 from ctxval.core.model import Model, Step, linearize
@@ -224,7 +224,7 @@ class _Loop:
 
     def _with_states(self, rounds: list[Round], judged: int | None = None) -> list[Trajectory]:
         """Return executions; with states of M, estimated as the first ``judged`` choose, if outputs are recorded."""
-        executed = [(trial.unit_point, trajectory) for trial, trajectory in self._executed(rounds)]
+        executed = at_points(self._executed(rounds))
         if self.first.validation.outputs is None:
             return [trajectory for _, trajectory in executed]
         judged = len(executed) if judged is None else judged

@@ -18,7 +18,7 @@ from ctxval._util.progress import progress_shown, stage
 from ctxval._util.representation import ShortRepr, Shown, call, lines
 from ctxval._util.texts import parted
 from ctxval.campaign.campaign import Campaign
-from ctxval.campaign.history import executed_trials
+from ctxval.campaign.history import at_points, executed_trials
 from ctxval.certificates import Certificate, CertificateOptions, Dynamics
 from ctxval.certificates.bounds import ERRORS, rank_of
 from ctxval.certificates.dynamics import draws_for
@@ -255,7 +255,7 @@ def _deviation_bound(
     """Return the bound that learned dynamics give on the largest deviation; None if they give none."""
     validation = campaign.validation.with_parts(distance=deviation)
     with suppress(Exception):  # users' parts, at states that no execution has reached
-        learned = DynamicsStudy(validation, campaign.seed).learn([(trial.unit_point, system) for trial, system in runs])
+        learned = DynamicsStudy(validation, campaign.seed).learn(at_points(runs))
         if learned is not None:
             maxima = learned.worst_case_of(draws_for(confidence)).maxima
             bound = float(np.sort(maxima)[min(rank_of(confidence, len(maxima)), len(maxima)) - 1])
