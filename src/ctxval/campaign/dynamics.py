@@ -13,12 +13,12 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.latest import Latest
 from ctxval._util.progress import stage
-from ctxval._util.texts import parted, reason_of
+from ctxval._util.texts import reason_of
 from ctxval.campaign.history import executed_trials, largest_distance, waiting_points
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates.dynamics import bound_of, draws_for
 from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, failed, jumps
-from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, PushedDistances, UntriedParameter
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory
@@ -28,7 +28,6 @@ from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.coverage import untried_corner
 from ctxval.learning.prediction import Executed
-from ctxval.learning.tolerance import LEVELS
 from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
@@ -209,16 +208,10 @@ class CampaignDynamics:
                 evidence = replace(evidence, missed=missed, highest=float(high), elites=elites)
         if learned.noisy is not None:
             return evidence  # a push is compared with residuals of state and input, which do not hold here
-        push, rates = learned.push_response, []
-        for name, unit in (parted(learned.labels[i]) for i in push.states):
-            per_second = f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
-            rates.append(f"{name} [{per_second}]" if unit else name)
-        residuals = dict(zip(rates, push.residuals.tolist(), strict=True))
-        return replace(evidence, pushed=PushedDistances(residuals, LEVELS, push.everywhere, push.away))
+        return replace(evidence, pushed=learned.push_response)
 
     def _evidence(self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase) -> DynamicsEvidence:
-        names, untried, noisy = self.study.validation.space.names, learned.untried_parameter, learned.noisy
-        actuator, predictions = learned.study.actuator, list(self.checked(trials))
+        noisy, actuator, predictions = learned.noisy, learned.study.actuator, list(self.checked(trials))
         # Drawn tests come with the distances of their tasks on what is learned by now.
         drawn = [k for k, test in enumerate(predictions) if test.origin in DRAWN and test.stored and not test.is_noisy]
         if drawn:
@@ -226,20 +219,13 @@ class CampaignDynamics:
             for k, distance in zip(drawn, np.nan_to_num(expected, nan=1e30, posinf=1e30).tolist(), strict=True):
                 predictions[k] = replace(predictions[k], explained=distance)
         return DynamicsEvidence(
-            worst.maxima,
-            worst.points,
-            worst.of_mean,
-            worst.elites,
-            worst.evaluations,
-            len(learned.executed),
-            worst.left_out,
-            0.0,
-            tuple(predictions),
-            learned.coverage,
-            unplanned=worst.unplanned,
-            untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:], learned.has_idle),
+            **vars(worst),
+            executions=len(learned.executed),
+            noise=0.0,
+            predictions=tuple(predictions),
+            coverage=learned.coverage,
+            untried=learned.untried_parameter,
             corner=untried_corner(learned.executed, self.study.validation.space, learned.coverage.task),
-            sharpness=worst.sharpness,
             dense=worst.points.shape[1] <= DENSE and self.study.planner.batched,
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
