@@ -180,37 +180,34 @@ class CampaignDynamics:
         return f"evidence {confidence} {self.study.quantile} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
     def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence:
-        draws = draws_for(confidence)
-        evidence = self._evidence(learned, trials, learned.worst_case_of(draws))
-        evidence = replace(
-            evidence,
-            noise=learned.drawn_from.noise,
-            groups=learned.drawn_from.functions_for(draws),
-            without_model=learned.posterior.covariances.without_model,
-        )
-        best = largest_distance(trials)
+        draws, drawn_from = draws_for(confidence), learned.drawn_from
+        without_model = learned.posterior.covariances.without_model
+        known = {"noise": drawn_from.noise, "groups": drawn_from.functions_for(draws), "without_model": without_model}
+        evidence = self._evidence(learned, trials, learned.worst_case_of(draws), **known)
+        best, found = largest_distance(trials), dict[str, Any]()
         bound = bound_of(evidence, best, confidence)
         if failed(evidence, bound) is not None:
-            evidence = replace(evidence, suspect=learned.study.suspected_parameter(learned))
+            found["suspect"] = learned.study.suspected_parameter(learned)
         if doubt_of(replace(evidence, tests=0), best, bound):  # how many tests a verdict needs is not known here
-            return evidence
+            return replace(evidence, **found)
         # Many closed loops, which only matter to a bound that nothing else withdraws.
-        jump = learned.study.search.largest_jump(learned.drawn_from)
-        evidence = replace(evidence, jump=jump, pocket=learned.pocket)
+        jump = learned.study.search.largest_jump(drawn_from)
+        found |= {"jump": jump, "pocket": learned.pocket}
         # The maxima of a distance with kinks lie on ridges, which deeper searches climb higher.
-        if is_kinked(learned.study.given.distance) or (evidence.dense and jumps(evidence, bound)):
+        if is_kinked(learned.study.given.distance) or (evidence.dense and jumps(replace(evidence, jump=jump), bound)):
             values, points = learned.deeper
             low, high = values.min(), values.max()
-            evidence = replace(evidence, disagreement=float(1 - low / high) if high > 0 else 0.0)
+            found["disagreement"] = float(1 - low / high) if high > 0 else 0.0
             if high > evidence.highest:
                 elites = np.concatenate([points[values.argmax()][None], evidence.elites])
-                missed = float(high / evidence.highest)
-                evidence = replace(evidence, missed=missed, highest=float(high), elites=elites)
-        if learned.noisy is not None:
-            return evidence  # a push is compared with residuals of state and input, which do not hold here
-        return replace(evidence, pushed=learned.push_response)
+                found |= {"missed": float(high / evidence.highest), "highest": float(high), "elites": elites}
+        if learned.noisy is None:  # a push is compared with residuals of state and input, which do not hold with noise
+            found["pushed"] = learned.push_response
+        return replace(evidence, **found)
 
-    def _evidence(self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase) -> DynamicsEvidence:
+    def _evidence(
+        self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase, noise: float = 0.0, **known: Any
+    ) -> DynamicsEvidence:
         noisy, actuator, predictions = learned.noisy, learned.study.actuator, list(self.checked(trials))
         # Drawn tests come with the distances of their tasks on what is learned by now.
         drawn = [k for k, test in enumerate(predictions) if test.origin in DRAWN and test.stored and not test.is_noisy]
@@ -221,7 +218,7 @@ class CampaignDynamics:
         return DynamicsEvidence(
             **vars(worst),
             executions=len(learned.executed),
-            noise=0.0,
+            noise=noise,
             predictions=tuple(predictions),
             coverage=learned.coverage,
             untried=learned.untried_parameter,
@@ -233,6 +230,7 @@ class CampaignDynamics:
             physical=learned.study.given.physical,
             without_data=not learned.with_data,
             estimated=learned.study.given.outputs is not None,
+            **known,
         )
 
     def checked(self, trials: Sequence[Trial]) -> tuple[CheckedPrediction, ...]:
