@@ -21,7 +21,7 @@ from ctxval import Campaign
 from ctxval._util.arrays import single_threaded
 from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import Automatic, CertificateOptions
-from ctxval.certificates.dynamics_evidence import PushedDistances
+from ctxval.core.learned_numbers import PushedDistances
 from strangers_development import DEVELOPMENT
 from study_drawn_tests import truth
 

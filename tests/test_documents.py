@@ -29,8 +29,9 @@ from ctxval.certificates import (
     certify_dynamics,
     draw_maxima,
 )
-from ctxval.certificates.expiry import Statistic, WatchedChannel, WatchState
+from ctxval.certificates.expiry import WatchedChannel, WatchState
 from ctxval.cli.config.settings import ExperimentSettings
+from ctxval.core.learned_numbers import Statistic
 from ctxval.core.trial import Origin, State
 from ctxval.data import Break, LogMapping, MemoryTable, recordings_of
 from ctxval.learning import ExecutionPrediction

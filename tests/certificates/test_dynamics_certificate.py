@@ -27,9 +27,10 @@ from ctxval.certificates import (
 from ctxval.certificates.bounds import NO_UNITS
 from ctxval.certificates.dynamics import bound_of
 from ctxval.certificates.dynamics_diagnostics import ACCURATE, GAP, PREDICTIONS
-from ctxval.certificates.dynamics_evidence import PushedDistances, StatePocket
 from ctxval.certificates.sentences.verdicts import undecided
 from ctxval.certificates.verdict import judge, judge_by
+from ctxval.core.coverage import StatePocket
+from ctxval.core.learned_numbers import PushedDistances
 from ctxval.errors import CertificateError
 from rig_evidence import COVERED, GOOD, gap, prediction
 from rig_thorough import more

@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from ctxval.certificates.expiry import EXCEEDED, Statistic, WatchedChannel, WatchState
+from ctxval.certificates.expiry import EXCEEDED, WatchedChannel, WatchState
+from ctxval.core.learned_numbers import Statistic
 from ctxval.errors import InputError
 from rig_thorough import more
 

@@ -13,12 +13,12 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.latest import Latest
 from ctxval._util.progress import stage
-from ctxval._util.texts import parted, reason_of
+from ctxval._util.texts import reason_of
 from ctxval.campaign.history import at_points, executed_trials
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates.dynamics import bound_of, draws_for
 from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, failed, jumps
-from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, PushedDistances, UntriedParameter
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory
@@ -28,7 +28,6 @@ from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.coverage import untried_corner
 from ctxval.learning.prediction import Executed
-from ctxval.learning.tolerance import LEVELS
 from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
@@ -183,44 +182,35 @@ class CampaignDynamics:
         return f"evidence {confidence} {self.study.quantile} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
     def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence:
-        draws = draws_for(confidence)
-        evidence = self._evidence(learned, trials, learned.worst_case_of(draws))
-        evidence = replace(
-            evidence,
-            noise=learned.drawn_from.noise,
-            groups=learned.drawn_from.functions_for(draws),
-            without_model=learned.posterior.covariances.without_model,
-        )
-        best = Trials(trials).largest
+        draws, drawn_from = draws_for(confidence), learned.drawn_from
+        without_model = learned.posterior.covariances.without_model
+        known = {"noise": drawn_from.noise, "groups": drawn_from.functions_for(draws), "without_model": without_model}
+        evidence = self._evidence(learned, trials, learned.worst_case_of(draws), **known)
+        best, further = Trials(trials).largest, dict[str, Any]()
         bound = bound_of(evidence, best, confidence)
         if failed(evidence, bound) is not None:
-            evidence = replace(evidence, suspect=learned.study.suspected_parameter(learned))
+            further["suspect"] = learned.study.suspected_parameter(learned)
         if doubt_of(replace(evidence, tests=0), best, bound):  # how many tests a verdict needs is not known here
-            return evidence
+            return replace(evidence, **further)
         # Many closed loops, which only matter to a bound that nothing else withdraws.
-        jump = learned.study.search.largest_jump(learned.drawn_from)
-        evidence = replace(evidence, jump=jump, pocket=learned.pocket)
+        jump = learned.study.search.largest_jump(drawn_from)
+        further |= {"jump": jump, "pocket": learned.pocket}
         # The maxima of a distance with kinks lie on ridges, which deeper searches climb higher.
-        if is_kinked(learned.study.given.distance) or (evidence.dense and jumps(evidence, bound)):
+        if is_kinked(learned.study.given.distance) or (evidence.dense and jumps(replace(evidence, jump=jump), bound)):
             values, points = learned.deeper
             low, high = values.min(), values.max()
-            evidence = replace(evidence, disagreement=float(1 - low / high) if high > 0 else 0.0)
+            further["disagreement"] = float(1 - low / high) if high > 0 else 0.0
             if high > evidence.highest:
                 elites = np.concatenate([points[values.argmax()][None], evidence.elites])
-                missed = float(high / evidence.highest)
-                evidence = replace(evidence, missed=missed, highest=float(high), elites=elites)
-        if learned.noisy is not None:
-            return evidence  # a push is compared with residuals of state and input, which do not hold here
-        push, rates = learned.push_response, []
-        for name, unit in (parted(learned.labels[i]) for i in push.states):
-            per_second = f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
-            rates.append(f"{name} [{per_second}]" if unit else name)
-        residuals = dict(zip(rates, push.residuals.tolist(), strict=True))
-        return replace(evidence, pushed=PushedDistances(residuals, LEVELS, push.everywhere, push.away))
+                further |= {"missed": float(high / evidence.highest), "highest": float(high), "elites": elites}
+        if learned.noisy is None:  # a push is compared with residuals of state and input, which do not hold with noise
+            further["pushed"] = learned.push_response
+        return replace(evidence, **further)
 
-    def _evidence(self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase) -> DynamicsEvidence:
-        names, untried, noisy = self.study.validation.space.names, learned.untried_parameter, learned.noisy
-        actuator, predictions = learned.study.actuator, list(self.checked(trials))
+    def _evidence(
+        self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase, noise: float = 0.0, **known: Any
+    ) -> DynamicsEvidence:
+        noisy, actuator, predictions = learned.noisy, learned.study.actuator, list(self.checked(trials))
         # Drawn tests come with the distances of their tasks on what is learned by now.
         drawn = [k for k, test in enumerate(predictions) if test.origin in DRAWN and test.stored and not test.is_noisy]
         if drawn:
@@ -228,20 +218,13 @@ class CampaignDynamics:
             for k, distance in zip(drawn, np.nan_to_num(expected, nan=1e30, posinf=1e30).tolist(), strict=True):
                 predictions[k] = replace(predictions[k], explained=distance)
         return DynamicsEvidence(
-            worst.maxima,
-            worst.points,
-            worst.of_mean,
-            worst.elites,
-            worst.evaluations,
-            len(learned.executed),
-            worst.left_out,
-            0.0,
-            tuple(predictions),
-            learned.coverage,
-            unplanned=worst.unplanned,
-            untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:], learned.has_idle),
+            **vars(worst),
+            executions=len(learned.executed),
+            noise=noise,
+            predictions=tuple(predictions),
+            coverage=learned.coverage,
+            untried=learned.untried_parameter,
             corner=untried_corner(learned.executed, self.study.validation.space, learned.coverage.task),
-            sharpness=worst.sharpness,
             dense=worst.points.shape[1] <= DENSE and self.study.planner.batched,
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
@@ -249,6 +232,7 @@ class CampaignDynamics:
             physical=learned.study.given.physical,
             without_data=not learned.with_data,
             estimated=learned.study.given.outputs is not None,
+            **known,
         )
 
     def checked(self, trials: Sequence[Trial]) -> tuple[CheckedPrediction, ...]:

@@ -12,7 +12,7 @@ from ctxval._util.progress import advance, stage
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.history import at_points, executed_trials
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.certificates.expiry import EXCEEDED, FEWEST, Statistic, WatchedChannel, WatchState
+from ctxval.certificates.expiry import EXCEEDED, FEWEST, WatchedChannel, WatchState
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
@@ -124,8 +124,7 @@ class Watch:
         statistics = self._statistics.later(trajectory, point, distance)
         if not all(0 < each.value < np.inf for each in statistics.values()):
             raise InputError(f"the run {name} has values that are missing, or too large for a comparison.")
-        plain = {key: Statistic(each.value, each.gradient, each.information) for key, each in statistics.items()}
-        self.state = self.state.after(name, plain, distance)
+        self.state = self.state.after(name, statistics, distance)
         return self.state
 
     def again(self, count: int = 3) -> list[Trial]:

@@ -6,7 +6,7 @@ from ctxval.certificates.base import KINDS, Certificate, CertificateKind, requir
 from ctxval.certificates.convergence import is_validated, rate
 from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, farthest_task, most_contested
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
-from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, LearnedDistance, UntriedParameter
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, LearnedDistance
 from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
@@ -17,7 +17,7 @@ from ctxval.certificates.sample import PLANNED, MadeGood, Sample, require_learne
 from ctxval.certificates.scenario import Audit, Region, SamplingDiscarding, Scenario, samples_needed, tail, volume_bound
 from ctxval.certificates.stopping import StoppingDecision, StoppingRule
 from ctxval.certificates.verdict import Assessment, Verdict, assess, judge, judge_by
-from ctxval.core.coverage import StateInputCoverage, StateInputGap, UntriedCorner
+from ctxval.core.coverage import StateInputCoverage, StateInputGap, UntriedCorner, UntriedParameter
 
 __all__ = [
     "KINDS",

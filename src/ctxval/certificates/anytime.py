@@ -22,7 +22,7 @@ from ctxval._util.checked import Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.sentences.statements import ABOUT_DRAWS, ONE_CAMPAIGN, distributed, share_above
+from ctxval.certificates.sentences.statements import ABOUT_DRAWS, distributed, share_above
 from ctxval.errors import CertificateError
 
 _NO_VIOLATION = 0.75
@@ -57,24 +57,13 @@ class AnytimeAudit(CertificateKind):
         statement = share_above(sample, volume, confidence, limit, n, remark)
         audited = f"the audited tasks are independent and {distributed(sample)}"
         fixed = f"the threshold {limit} was fixed before any of them was known"
-        assumptions = (audited, fixed, *ABOUT_DRAWS, *sample.remarks, ONE_CAMPAIGN)
+        assumptions = (audited, fixed, *ABOUT_DRAWS)
         details = {
             "violations": int(violating.sum()),
             "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
             "failed": drawn.failed,
-            "failures": sample.failures,
         }
-        return Certificate(
-            kind=self.name,
-            statement=statement,
-            upper_bound=threshold,
-            confidence=confidence,
-            volume=volume,
-            trials=n,
-            assumptions=assumptions,
-            details=details,
-            distribution=sample.distribution,
-        )
+        return self.certificate(sample, statement, threshold, confidence, assumptions, details, volume=volume, trials=n)
 
 
 def anytime_volume(violating: Mask, beta: float) -> float:

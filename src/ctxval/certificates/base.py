@@ -14,6 +14,7 @@ from ctxval._util.version import VERSION
 from ctxval.certificates.bounds import ERRORS, as_text, at_most, with_error
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences import verdicts as sentences
+from ctxval.certificates.sentences.statements import ONE_CAMPAIGN
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Origin
@@ -144,6 +145,29 @@ class CertificateKind(ShortRepr, ABC):
 
         A CertificateError is raised if the trials or the options do not allow one.
         """
+
+    def certificate(
+        self,
+        sample: Sample,
+        statement: str,
+        upper_bound: float,
+        confidence: float,
+        assumptions: Iterable[str],
+        details: Mapping[str, Any],
+        **others: Any,
+    ) -> Certificate:
+        """Return a certificate of all tasks and trials, or with ``others`` of its attributes.
+
+        What all kinds share is added: remarks on failures, the assumption of one campaign, the distribution of tasks.
+        """
+        values = {
+            "volume": 0.0,
+            "trials": len(sample),
+            "assumptions": (*assumptions, *sample.remarks, ONE_CAMPAIGN),
+            "details": {**details, "failures": sample.failures},
+            "distribution": None if self.bounds_maximum else sample.distribution,
+        }
+        return Certificate(self.name, statement, upper_bound, confidence, **{**values, **others})
 
     def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
         """Raise a CertificateError if so many trials could never be certified, before they are paid for.

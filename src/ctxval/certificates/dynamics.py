@@ -35,6 +35,11 @@ from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError
 
+# Attributes of the evidence that are numbers of the certificate as well.
+_COPIED = (
+    *("noise", "quantile", "lags", "actuator", "physical", "suspect", "without_model", "without_data", "estimated"),
+    *("sharpness", "jump", "missed", "disagreement"),
+)
 MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
 
 
@@ -121,8 +126,8 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
         )
     empty = None if sample.suite is not None else largest_empty_box(sample.points)
     statement = statements.dynamics_statement(upper, error, confidence, evidence.quantile)
-    assumptions = (*statements.dynamics_assumptions(evidence), *sample.remarks, statements.ONE_CAMPAIGN)
-    doubt, n = doubt or diagnostics.doubt_of(evidence, sample.best, bound), len(sample)
+    assumptions = statements.dynamics_assumptions(evidence)
+    doubt, plain = doubt or diagnostics.doubt_of(evidence, sample.best, bound), evidence.to_json()
     details = {
         "best": sample.best,
         **({} if sample.suite is None else {"tasks": sample.tasks, "not_executed": sample.not_executed}),
@@ -151,22 +156,14 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
         "coverage_gap_of_pairs": None if coverage.pair is None else coverage.pair.size,
         "largest_gap_at": coverage.marginal.place,
         "resolution": coverage.resolution,
-        "noise": evidence.noise,
-        "quantile": evidence.quantile,
-        "lags": evidence.lags,
-        "actuator": evidence.actuator and list(evidence.actuator),
-        "physical": list(evidence.physical),
-        "suspect": evidence.suspect and list(evidence.suspect),
-        **{name: getattr(evidence, name) for name in ("without_model", "without_data", "estimated")},
-        **{name: getattr(evidence, name) for name in ("sharpness", "jump", "missed", "disagreement")},
+        **{name: plain[name] for name in _COPIED},
         "variance_left_out": evidence.left_out,
         "pocket": evidence.pocket and asdict(evidence.pocket),
         "empty_box": None if empty is None else asdict(empty),
         "pushed": evidence.pushed and evidence.pushed.to_json(),
-        "failures": sample.failures,
         "differing": None if differing is None else [sample.numbers[row] for row in differing],
     }
-    return Certificate("dynamics", statement, upper, confidence, 0.0, n, assumptions, details, doubt, error)
+    return Dynamics().certificate(sample, statement, upper, confidence, assumptions, details, doubt=doubt, error=error)
 
 
 def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> float:

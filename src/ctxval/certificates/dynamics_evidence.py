@@ -12,7 +12,8 @@ from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import rank_of
 from ctxval.certificates.prediction_tests import MANY, TESTS
-from ctxval.core.coverage import StateInputCoverage, StateInputGap, StatePocket, UntriedCorner
+from ctxval.core.coverage import StateInputCoverage, StateInputGap, StatePocket, UntriedCorner, UntriedParameter
+from ctxval.core.learned_numbers import PushedDistances
 from ctxval.core.quantiles import LEVELS, QUANTILE, chance_of_more
 from ctxval.core.trial import Origin
 
@@ -62,71 +63,6 @@ class CheckedPrediction(ShortRepr):
         plain = {name: value for name, value in asdict(self).items() if name not in ("quantiles", "runs")}
         unknown = [name for name, value in plain.items() if isinstance(value, float) and not np.isfinite(value)]
         return {**plain, **dict.fromkeys(unknown)}
-
-
-@dataclass(frozen=True, eq=False)
-class UntriedParameter(ShortRepr):
-    """A task parameter that hardly changes the closed loops of M."""
-
-    name: str  #: its name
-    gap: float  #: the largest distance of one of its values to the nearest executed one, as a share of its range
-    task: Array  #: a task in that gap, a point of the unit cube ``(d,)``
-    idle: bool = False  #: whether a parameter of this kind changes no predicted distance either; not of a suite
-
-
-@dataclass(frozen=True)
-class Tolerance:
-    """The smallest push that brings a task above a threshold, in the state in which it takes least."""
-
-    state: str  #: the rate of change of the state, with its units, such as ``speed [m/s^2]``
-    push: float  #: the size of the push; infinity if the largest one that was tried does not suffice
-    residual: float  #: the largest residual that was recorded, in the same units
-
-    @property
-    def ratio(self) -> float:
-        """The push as a multiple of the largest recorded residual."""
-        return self.push / self.residual
-
-
-@dataclass(frozen=True, eq=False)
-class PushedDistances(ShortRepr):
-    """The largest distances if something that no record shows pushes a state, on the posterior mean."""
-
-    residuals: dict[str, float]  #: largest recorded residual of the rate of change of each pushed state, by its label
-    levels: Array  #: the sizes of the pushes as multiples of these residuals, ascending from 0, shape ``(L,)``
-    everywhere: Array  #: the largest distance for each state and size, shape ``(k, L)``
-    away: Array  #: the same if the push acts only where no record is near
-
-    def to_json(self) -> dict[str, Any]:
-        """Return all attributes, ready for JSON: distances that are not finite are None."""
-        everywhere, away = (
-            [[d if np.isfinite(d) else None for d in row] for row in distances.tolist()]
-            for distances in (self.everywhere, self.away)
-        )
-        return {"residuals": self.residuals, "levels": self.levels.tolist(), "everywhere": everywhere, "away": away}
-
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> Self:
-        """Return the distances that :meth:`to_json` returned."""
-        arrays = (np.array(values[name], dtype=np.float64) for name in ("levels", "everywhere", "away"))
-        return cls(values["residuals"], *(np.where(np.isnan(array), np.inf, array) for array in arrays))
-
-    def tolerance(self, threshold: float, *, away: bool = False) -> Tolerance:
-        """Return the smallest push that brings a task above the threshold, interpolated between the sizes."""
-
-        def ratio(distances: Array) -> float:
-            k = int(np.searchsorted(distances > threshold, True))
-            if k in (0, len(distances)):
-                return np.inf if k else 0.0
-            low, below = self.levels[k - 1], distances[k - 1]
-            rise = distances[k] - below
-            share = (threshold - below) / rise if np.isfinite(rise) else 0.0
-            return float(low + share * (self.levels[k] - low))
-
-        # What may act at every step may also act where no record is near alone, which can be worse.
-        ratios = map(ratio, self.away if away else np.maximum(self.everywhere, self.away))
-        (state, residual), least = min(zip(self.residuals.items(), ratios, strict=True), key=lambda pair: pair[1])
-        return Tolerance(state, least * residual, residual)
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,6 +39,7 @@ from scipy.special import gammaln
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.sentences import withdrawals
+from ctxval.core.learned_numbers import Statistic
 from ctxval.errors import InputError
 
 EXCEEDED = "distances above the threshold"
@@ -179,17 +180,6 @@ class SlopeBets:
         return np.asarray(likelihoods[1:] - likelihoods[0])
 
 
-@dataclass(frozen=True, eq=False)
-class Statistic:
-    """The statistic of one run in a channel."""
-
-    value: float  #: positive
-    #: gradient, information: what the run says of coefficients w, whose likelihood is proportional to ``exp(w' gradient
-    #: - w' information w / 2)``, shapes ``(k,)`` and ``(k, k)``; None if there is no noise
-    gradient: Array | None = None
-    information: Array | None = None
-
-
 @dataclass(frozen=True)
 class WatchedChannel(ShortRepr):
     """One kind of statistics."""
@@ -292,9 +282,12 @@ class WatchState(ShortRepr):
         """Return all attributes and the sentence, ready for JSON."""
         names = ("threshold", "false_alarms", "evidence", "alarm", "since", "cause", "ratio")
         of_channel = ("name", "certified", "freedom", "information")
+        of_statistic = ("value", "gradient", "information")
         channels = [{name: getattr(channel, name) for name in of_channel} for channel in self.channels]
         for described, channel in zip(channels, self.channels, strict=True):
-            described["later"] = [statistic and vars(statistic) for statistic in channel.later]
+            described["later"] = [
+                each and {name: getattr(each, name) for name in of_statistic} for each in channel.later
+            ]
         return {
             **{name: getattr(self, name) for name in names},
             "channels": json.loads(json.dumps(channels, default=lambda array: array.tolist())),

@@ -93,12 +93,10 @@ class Posterior(CertificateKind):
             "logarithm": float(np.mean([np.isfinite(process.warp.offset) for process in processes])),
             "length_scales": np.median(np.exp([each.log_scales for each in hyperparameters]), axis=0).tolist(),
             "diagnosis": {name: value for name, value in vars(diagnosis).items() if name != "doubt"},
-            "failures": sample.failures,
         }
         statement = statements.posterior_statement(upper, error, confidence, stochastic=stochastic)
         doubt = statements.both_outcomes(sample, stochastic=stochastic) or diagnosis.doubt
-        assumptions, n = (*assumed, *sample.remarks, statements.ONE_CAMPAIGN), len(sample)
-        return Certificate(self.name, statement, upper, confidence, 0.0, n, assumptions, details, doubt, error)
+        return self.certificate(sample, statement, upper, confidence, assumed, details, doubt=doubt, error=error)
 
 
 def instantaneous_bound(sample: Sample) -> dict[str, float] | None:

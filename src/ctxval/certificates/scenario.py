@@ -36,7 +36,6 @@ from ctxval.certificates.sentences.statements import (
     ABOUT_DRAWS,
     FROZEN,
     NO_BOUND,
-    ONE_CAMPAIGN,
     UNSEEN,
     how_drawn,
     margin_and_map,
@@ -103,13 +102,9 @@ class Scenario(CertificateKind):
             *how_drawn(sample, sample, "the trials"),
             "the number discarded was chosen before the distances were known",
             *(UNSEEN, "each task has one distance: the system is deterministic", NO_BOUND),
-            *sample.remarks,
-            ONE_CAMPAIGN,
         )
-        details = {"discarded": discarded, "failed": sample.failed, "failures": sample.failures}
-        return Certificate(
-            self.name, statement, h, confidence, volume, n, assumptions, details, distribution=sample.distribution
-        )
+        details = {"discarded": discarded, "failed": sample.failed}
+        return self.certificate(sample, statement, h, confidence, assumptions, details, volume=volume)
 
     def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
         """Require independent draws alone, the number to discard, and more trials than that."""
@@ -218,7 +213,7 @@ class Audit(CertificateKind):
         chosen = sample.distances[[origin != "iid" for origin in sample.origins]]
         largest = float(np.nanmax(chosen)) if np.isfinite(chosen).any() else None
         statement = share_above(sample, volume, confidence, at_most(h), n, ", the largest one found")
-        assumptions = (*how_drawn(sample, drawn), *ABOUT_DRAWS, *sample.remarks, ONE_CAMPAIGN)
+        assumptions = (*how_drawn(sample, drawn), *ABOUT_DRAWS)
         details = {
             "largest_found": h,
             "largest_drawn": drawn.best,
@@ -226,11 +221,8 @@ class Audit(CertificateKind):
             "exceeding": None if largest is None else int((drawn.distances > largest).sum()),
             "not_counted": len(sample.only("iid")) - n,
             "failed": sample.failed,
-            "failures": sample.failures,
         }
-        return Certificate(
-            self.name, statement, h, confidence, volume, n, assumptions, details, distribution=sample.distribution
-        )
+        return self.certificate(sample, statement, h, confidence, assumptions, details, volume=volume, trials=n)
 
 
 # A prediction with a margin
@@ -285,7 +277,7 @@ class Region(CertificateKind):
             kept = f"this prediction keeps {limit:.6g} on {tasks} (an estimate from {count} predicted tasks)"
         statement = margin_and_map(sample, margin, volume, total, confidence, at_most(limit), kept)
         chosen = "the number discarded was chosen before the draws were known"
-        assumptions = (*how_drawn(sample, drawn), chosen, FROZEN, *ABOUT_DRAWS, *sample.remarks, ONE_CAMPAIGN)
+        assumptions = (*how_drawn(sample, drawn), chosen, FROZEN, *ABOUT_DRAWS)
         details = {
             "margin": margin,
             "discarded": self.discard,
@@ -299,11 +291,8 @@ class Region(CertificateKind):
             "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
             "not_counted": len(sample.only("iid")) - n,
             "failed": sample.failed,
-            "failures": sample.failures,
         }
-        return Certificate(
-            self.name, statement, limit, confidence, total, n, assumptions, details, distribution=sample.distribution
-        )
+        return self.certificate(sample, statement, limit, confidence, assumptions, details, volume=total, trials=n)
 
     def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
         """Require more trials than are discarded."""

@@ -51,3 +51,13 @@ class UntriedCorner(ShortRepr):
     place: dict[str, float]  #: the two components by their labels
     gap: float  #: the distance of the nearest executed task, of the farther component, as a share of its range
     task: Array  #: a task there, a point of the unit cube ``(d,)``
+
+
+@dataclass(frozen=True, eq=False)
+class UntriedParameter(ShortRepr):
+    """A task parameter that hardly changes the closed loops of M."""
+
+    name: str  #: its name
+    gap: float  #: the largest distance of one of its values to the nearest executed one, as a share of its range
+    task: Array  #: a task in that gap, a point of the unit cube ``(d,)``
+    idle: bool = False  #: whether a parameter of this kind changes no predicted distance either; not of a suite

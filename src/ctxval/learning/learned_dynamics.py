@@ -11,8 +11,9 @@ import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import ShortRepr
-from ctxval.core.coverage import StateInputCoverage, StatePocket
+from ctxval.core.coverage import StateInputCoverage, StatePocket, UntriedParameter
 from ctxval.core.labels import labels_of
+from ctxval.core.learned_numbers import PushedDistances
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import AnyDraws, distances_of, loop_pairs
 from ctxval.learning.coverage import (
@@ -27,7 +28,7 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import SETTLED, NoisyDraws, NoisyPosterior
 from ctxval.learning.regular import Boundary, RegularTransitions
-from ctxval.learning.tolerance import PushResponse, push_response
+from ctxval.learning.tolerance import push_response
 from ctxval.learning.worst_case import WorstCase
 
 if TYPE_CHECKING:
@@ -173,11 +174,11 @@ class LearnedDynamics(ShortRepr):
         return self.study.search.deeper(self.drawn_from, self._rng(3))
 
     @functools.cached_property
-    def push_response(self) -> PushResponse:
+    def push_response(self) -> PushedDistances:
         """The largest distances over large, executed and random tasks if something pushes the posterior mean."""
         search = self.study.search
         tasks = [self.worst_of_mean.elites[:16], self.executed, search.pool[:16]]
-        return push_response(self.study.planner, self.posterior, np.concatenate(tasks))
+        return push_response(self.study.planner, self.posterior, np.concatenate(tasks), self.labels)
 
     @functools.cached_property
     def labels(self) -> tuple[str, ...]:
@@ -216,11 +217,11 @@ class LearnedDynamics(ShortRepr):
         return largest_pocket(visited[finite], executed, labels, self.positions, rows[finite], pool)
 
     @property
-    def untried_parameter(self) -> tuple[int, float, Array] | None:
-        """A parameter without effect on M's loops, its largest gap as a share of its range, and a task in the gap."""
-        members, executed = self.study.validation.space.members, self.executed
+    def untried_parameter(self) -> UntriedParameter | None:
+        """The parameter without effect on M's loops whose gap is largest; None if there is none."""
+        space, executed = self.study.validation.space, self.executed
         gaps = [
-            (j, *farthest_value(executed[:, j], None if members is None else members[:, j]))
+            (j, *farthest_value(executed[:, j], None if space.members is None else space.members[:, j]))
             for j in self.study.unseen_parameters
         ]
         if not gaps:
@@ -228,7 +229,7 @@ class LearnedDynamics(ShortRepr):
         j, gap, value = max(gaps, key=lambda each: each[1])
         task = self.coverage.task.copy()
         task[j] = value
-        return j, gap, task
+        return UntriedParameter(space.names[j], gap, task, self.has_idle)
 
     @functools.cached_property
     def has_idle(self) -> bool:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
+from ctxval.core.learned_numbers import Statistic
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.histories import Record
@@ -50,7 +51,7 @@ class RunStatistics:
         """Whether residuals are noise, whose law is known, rather than what a function has left unknown."""
         return self.learned.noisy is not None and self.learned.noisy.is_noisy
 
-    def certified(self, k: int, distance: float) -> dict[str, RunStatistic] | None:
+    def certified(self, k: int, distance: float) -> dict[str, Statistic] | None:
         """Return the statistics of one of the executions, predicted from the others; None if nothing predicts it."""
         others = self.learned.study.without(self.learned, k)
         if others is None:
@@ -64,7 +65,7 @@ class RunStatistics:
         point: Array | None,
         distance: float | None,
         learned: LearnedDynamics | None = None,
-    ) -> dict[str, RunStatistic]:
+    ) -> dict[str, Statistic]:
         """Return the statistics of a later run; without its task ``(d,)`` and distance, only those of the residuals."""
         learned = self.learned if learned is None else learned
         study, floors = learned.study, self.floors**2
@@ -87,9 +88,9 @@ class RunStatistics:
         information = columns.T @ columns
         statistics = {}
         for i, name in enumerate(names(study, len(whole))):
-            statistics[f"{name} residuals"] = RunStatistic(float(whole[i]), float(H))
-            known = (gradients[:, i], information / (noise + floors)[i]) if self.has_noise else (None, None)
-            statistics[f"systematic {name} residuals"] = RunStatistic(float(trend[i]), float(rank), *known)
+            statistics[f"{name} residuals"] = Statistic(float(whole[i]), freedom=float(H))
+            slope, known = (gradients[:, i], information / (noise + floors)[i]) if self.has_noise else (None, None)
+            statistics[f"systematic {name} residuals"] = Statistic(float(trend[i]), slope, known, float(rank))
         if point is not None and distance is not None:
             predicted = None
             with contextlib.suppress(Exception):  # the user's parts, at states that no execution has reached
@@ -97,19 +98,8 @@ class RunStatistics:
             if predicted is not None and np.isfinite(predicted.median):
                 least = (NEGLIGIBLE * self.threshold) ** 2
                 error = (distance - predicted.median) ** 2
-                statistics[DISTANCE] = RunStatistic(float((error + least) / (predicted.deviation**2 + least)), 1.0)
+                statistics[DISTANCE] = Statistic(float((error + least) / (predicted.deviation**2 + least)), freedom=1.0)
         return statistics
-
-
-@dataclass(frozen=True)
-class RunStatistic:
-    """One statistic of a run."""
-
-    value: float  # positive
-    freedom: float  # the degrees of freedom that white noise gives it
-    # gradient, information: of the coefficients of 1, state and input, (k,) and (k, k); None without noise
-    gradient: Array | None = None
-    information: Array | None = None
 
 
 # The statistic of the executed distance: its squared error, standardised by the draws of the dynamics.

@@ -7,12 +7,14 @@ no record is near. A contact that nobody met, or a load that nobody carried, is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval._util.texts import parted
+from ctxval.core.learned_numbers import PushedDistances
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.draws import DisturbedDynamics, DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
@@ -21,20 +23,14 @@ LEVELS = np.array([0.0, *2.0 ** np.arange(-4, 4)])  # sizes of pushes, as multip
 NEAR = 0.05  # largest distance to a recorded state of what it shows, as a share of the range of each state
 
 
-@dataclass(frozen=True, eq=False)
-class PushResponse:
-    """The largest distances over some tasks if the posterior mean is pushed."""
+def push_response(
+    planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array, labels: Sequence[str]
+) -> PushedDistances:
+    """Return the largest distances over tasks ``(q, d)`` if the posterior mean is pushed in each learned state.
 
-    states: Rows  # the states that are pushed: those in which M errs, (k,)
-    residuals: Array  # the largest recorded residual of each of them per second, in the system's units, (k,)
-    # everywhere, away: the largest distance for each state and each of LEVELS, (k, L), if the push acts everywhere, and
-    # if it acts only where no record is near; infinity if a rollout diverges
-    everywhere: Array
-    away: Array
-
-
-def push_response(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> PushResponse:
-    """Return the largest distances over tasks ``(q, d)`` if the posterior mean is pushed in each learned state."""
+    These are the states in which M errs; ``labels`` are those of all states. Distances of rollouts that diverge are
+    infinity.
+    """
     data, planned = posterior.data, planner.plan(tasks)
     states, n = np.flatnonzero(data.learned), len(data.sizes)
     residuals = (np.abs(data.outputs).max(axis=0) * data.sizes)[states]
@@ -52,7 +48,12 @@ def push_response(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Arr
             distances = np.nan_to_num(planner.distances(dynamics, planned, len(tasks)), nan=0.0, posinf=np.inf)
             signed = distances.max(axis=1).reshape(pushes.shape[:3])
             largest.append(np.maximum.accumulate(signed.max(axis=1), axis=1))
-    return PushResponse(states, residuals / planned[0].task.dt, *largest)
+    rates = []
+    for name, unit in (parted(labels[i]) for i in states.tolist()):
+        per_second = f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
+        rates.append(f"{name} [{per_second}]" if unit else name)
+    of_rates = dict(zip(rates, (residuals / planned[0].task.dt).tolist(), strict=True))
+    return PushedDistances(of_rates, LEVELS, *largest)
 
 
 def pushed(

@@ -63,7 +63,7 @@ class WorstCase:
 
     maxima: Array  # the largest distance of each draw, (S,); infinity if its closed loop diverges
     points: Array  # where it lies, points of the unit cube (S, d)
-    of_mean: float
+    highest: float  # the largest distance on the posterior mean
     elites: Array  # tasks with large distances on the posterior mean, points (e, d), the largest first
     evaluations: int  # number of closed loops that were compared; a few of them may be the same
     left_out: float  # largest share of the posterior variance that a draw leaves out between its pivots

@@ -23,10 +23,10 @@ from ctxval.certificates.bounds import (
     with_units,
 )
 from ctxval.certificates.covering import RESOLUTION, EmptyBox
-from ctxval.certificates.dynamics_evidence import PushedDistances, Tolerance
 from ctxval.certificates.sample import executions_of
 from ctxval.certificates.sentences.statements import condition_on_dynamics, conditions_on_dynamics
 from ctxval.certificates.sentences.withdrawals import REFINED
+from ctxval.core.learned_numbers import PushedDistances, Tolerance
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Trial
 
