@@ -84,7 +84,7 @@ def test_a_miss_is_a_share_of_the_range_over_all_tasks() -> None:
     assert found.misses.tolist() == [[0, 0], [0.5, 0]]
     assert found.shares.tolist() == [[0, 0], [0.25, 0]]
     assert found.missed.tolist() == [False, True]
-    assert found.worst == (1, 0)
+    assert found.worst == (1, 0, 0.5)
 
 
 def test_only_a_task_that_was_given_a_goal_or_a_reference_has_one() -> None:

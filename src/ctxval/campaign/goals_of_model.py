@@ -33,15 +33,14 @@ class GoalsOfModel:
         misses = goal_misses(self._validation, on_model, [each.task.goal for each in self._plans])
         if misses is None or not misses.missed.any():
             return
-        row, column = misses.worst
+        row, state, size = misses.worst
         names = labels_of(self._validation.names(on_model[0].states.shape[-1], on_model[0].inputs.shape[-1])[0])
         where = self._validation.space.describe_point(self._plans[row].parameters.points)
-        miss = f"{misses.misses[row, column]:.3g} in {names[int(misses.states[column])]}"
         self._warned = True
         warnings.warn(
             f"the model itself does not complete its tasks: in {misses.missed.sum()} of {len(self._plans)} it ends "
-            f"more than {100 * MISSED:g} % of the range of a state from its goal, by {miss} for the task {where}. "
-            "A validation against such a model says little: see `ctxval check --aspect1`.",
+            f"more than {100 * MISSED:g} % of the range of a state from its goal, by {size:.3g} in {names[state]} for "
+            f"the task {where}. A validation against such a model says little: see `ctxval check --aspect1`.",
             GoalWarning,
             stacklevel=2,
         )

@@ -180,6 +180,23 @@ def _show_warning(message: Warning | str, category: type[Warning], *place: Any, 
 
 
 @dataclass(frozen=True)
+class NewStore:
+    """Where the store of an experiment is, and what it is made with if it is not there."""
+
+    store: Path | None = None
+    search: str | None = None
+    seed: int | None = None
+
+
+@dataclass(frozen=True)
+class Parallel:
+    """How executions are made: in how many processes, and for how long at most."""
+
+    workers: int | None = None
+    timeout: float | None = None
+
+
+@dataclass(frozen=True)
 class Allowed:
     """What may be done with the experiment of a store: whose code may run, and why it may have changed."""
 
@@ -253,8 +270,15 @@ def status_of(verdict: Verdict | None) -> int:
     return FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
 
 
-def worst_of(trial: Trial | None) -> dict[str, Any] | None:
-    return None if trial is None else {"task": trial.parameters, "distance": trial.distance}
+def summary_of(trials: Trials) -> dict[str, Any]:
+    """Return what became of the trials in a store."""
+    failures, worst = failures_of(trials), trials.worst
+    return {
+        "executions": trials.executions,
+        "failed": sum(len(failure["trials"]) for failure in failures),
+        "failures": failures,
+        "worst": None if worst is None else {"task": worst.parameters, "distance": worst.distance},
+    }
 
 
 def failures_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:

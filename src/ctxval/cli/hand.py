@@ -16,9 +16,10 @@ from ctxval.campaign import by_hand
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.campaign.telling import SuppliedResult
+from ctxval.cli import base
 from ctxval.cli.base import Allowed, command, named_values, out, print_verdict, require_folder, status_of
 from ctxval.cli.config.settings import ExperimentSettings
-from ctxval.cli.config.stored_settings import Opened, budget_of, limit_of, open_store, open_target, trusted_settings
+from ctxval.cli.config.stored_settings import Limits, Opened, open_store, open_target, trusted_settings
 from ctxval.core.exchange import TASK_FORMAT
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import InputError
@@ -31,7 +32,8 @@ _WAIT = 60.0  #: seconds to wait for other terminals: each of them locks the sto
 def ask(
     target: str,
     allowed: Allowed,
-    store: Path | None = None,
+    made: base.NewStore,
+    limits: Limits,
     out_: Path | None = None,
     parameters: list[str] | None = None,
     draw: bool = False,
@@ -39,17 +41,13 @@ def ask(
     because: str | None = None,
     trial: int | None = None,
     explore: bool = False,
-    threshold: float | None = None,
-    budget: int | None = None,
-    search: str | None = None,
-    seed: int | None = None,
     force: bool = False,
     option: list[str] | None = None,
 ) -> Any:
     stated = sum((bool(parameters), draw, again is not None, trial is not None, explore))
     if stated > 1:
         raise InputError("--set, --draw, --again, --trial and --explore cannot be combined.")
-    if stated and (threshold is not None or budget is not None):
+    if stated and limits != Limits():
         flags = "--set, --draw, --again, --trial and --explore"
         raise InputError(f"--threshold and --budget are for a trial that decides a verdict; {flags} open another one.")
     if because is not None and again is None:
@@ -58,16 +56,15 @@ def ask(
         require_folder(out_, by_hand.TRIAL_FILES, TASK_FORMAT, force=force)
     if Path(target).suffix in STORE_SUFFIXES and not Path(target).exists():
         raise InputError(f"there is no store at {target}; `ctxval ask FILE.toml --store {target}` creates one.")
-    overrides = {"store": store, "search": search, "seed": seed, "options": named_values(option) or None}
-    opened = open_target(target, overrides, allowed)
+    opened = open_target(target, {**vars(made), "options": named_values(option) or None}, allowed)
     experiment, settings, campaign, path = opened.experiment, opened.settings, opened.campaign, opened.path
-    limit = limit_of(experiment, settings, threshold)
+    limit, total = limits.completed_by(settings, experiment)
     if trial is None and limit is not None:
         campaign.state_threshold(limit)
     if trial is not None:
         waiting = campaign.reopen(trial)
-    elif limit is not None and not stated and (threshold is not None or not settings.explores):
-        certificate, total = settings.certificate_options, budget_of(experiment, settings, budget)
+    elif limit is not None and not stated and (limits.threshold is not None or not settings.explores):
+        certificate = settings.certificate_options
         asked = campaign.ask_for_verdict(limit, total, certificate=certificate, wait=_WAIT)
         if asked is None:
             verdict = campaign.verdict(limit, certificate=certificate)
@@ -197,12 +194,11 @@ def _ended(opened: Opened, trial: Trial) -> dict[str, Any]:
 def serve(
     store: Path,
     allowed: Allowed,
+    limits: Limits,
     host: str = "127.0.0.1",
     port: int = 8765,
     token: str | None = None,
     allow_host: list[str] | None = None,
-    threshold: float | None = None,
-    budget: int | None = None,
 ) -> Any:
     web = require_extra("ctxval.web.server", "web", "the page needs")
     settings = trusted_settings(Store.existing(store), experiment=allowed.experiment, trust=allowed.trust)
@@ -213,21 +209,21 @@ def serve(
             out.say("everybody who has this address can record results. It is sent without encryption.")
         out.say("Ctrl-C stops the server; all results are stored.")
 
-    again = functools.partial(_reopened, settings, store, threshold, budget)  # a child process unpickles it
+    again = functools.partial(_reopened, settings, store, limits)  # a child process unpickles it
     where: dict[str, Any] = {"host": host, "port": port, "token": token, "names": allow_host or ()}
-    web.serve(lambda: _served(open_store(store, allowed), threshold, budget), again, say_started, **where)
+    web.serve(lambda: _served(open_store(store, allowed), limits), again, say_started, **where)
 
 
-def _reopened(settings: ExperimentSettings, path: Path, threshold: float | None, budget: int | None) -> ServedCampaign:
+def _reopened(settings: ExperimentSettings, path: Path, limits: Limits) -> ServedCampaign:
     """Open a store by settings that the user has allowed to run here: those in it may have been changed since."""
     experiment = settings.load()
     campaign = settings.campaign(experiment, Store.existing(path))
-    return _served(Opened(settings, experiment, campaign, path), threshold, budget)
+    return _served(Opened(settings, experiment, campaign, path), limits)
 
 
-def _served(opened: Opened, threshold: float | None, budget: int | None) -> ServedCampaign:
+def _served(opened: Opened, limits: Limits) -> ServedCampaign:
     experiment, settings = opened.experiment, opened.settings
-    limit, total = limit_of(experiment, settings, threshold), budget_of(experiment, settings, budget)
+    limit, total = limits.completed_by(settings, experiment)
     if limit is not None:
         opened.campaign.state_threshold(limit)
     return ServedCampaign(experiment, opened.campaign, limit, settings.certificate_options, total)

@@ -21,7 +21,7 @@ from ctxval.campaign.by_hand import parameters_from, read_runs
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.watching import FALSE_ALARMS
 from ctxval.cli.base import FALSIFIED, Allowed, command, notes, out, print_columns, require_outputs
-from ctxval.cli.config.stored_settings import Opened, limit_of, open_store
+from ctxval.cli.config.stored_settings import Limits, Opened, open_store
 from ctxval.cli.recordings import Logs, print_breaks, print_errors
 from ctxval.core.trajectory import Trajectory
 from ctxval.data import Field, LogMapping, Observer
@@ -46,7 +46,7 @@ def watch(
 ) -> Any:
     require("start tolerance", NonNegativeFloat | None, start_tolerance)
     opened = open_store(store, allowed)
-    limit = limit_of(opened.experiment, opened.settings, threshold)
+    limit, _ = Limits(threshold).completed_by(opened.settings, opened.experiment)
     if limit is None:
         why = "neither the store nor the experiment has one"
         raise InputError(f"a threshold is needed: give --threshold, because {why}.")

@@ -9,18 +9,20 @@ import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ctxval import Campaign, Experiment, Truth, Verdict
 from ctxval._util.progress import also_listening
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.texts import reason_of
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.storage.other_stores import other_stores
+from ctxval.certificates import Certificate
+from ctxval.certificates.envelope import Envelope
 from ctxval.cli import base
-from ctxval.cli.base import command, err, named_values, out, print_table
+from ctxval.cli.base import NewStore, Parallel, command, err, named_values, out, print_table
 from ctxval.cli.config.settings import ExperimentSettings, read_settings
-from ctxval.cli.config.stored_settings import budget_of, limit_of
+from ctxval.cli.config.stored_settings import Limits
 from ctxval.cli.stores import print_envelope
 from ctxval.core.trajectory import Transitions
 from ctxval.core.trial import designs_sentence
@@ -35,9 +37,9 @@ if TYPE_CHECKING:
 @command()
 def run(
     target: str,
-    budget: int | None = None,
-    search: str | None = None,
-    threshold: float | None = None,
+    made: NewStore,
+    limits: Limits,
+    parallel: Parallel,
     confidence: float | None = None,
     explore: bool | None = None,
     envelope: bool = False,
@@ -45,43 +47,31 @@ def run(
     tests: int | None = None,
     quantile: float | None = None,
     resolution: float | None = None,
-    seed: int | None = None,
-    store: Path | None = None,
     truth: bool = False,
-    workers: int | None = None,
     dask: str | None = None,
-    timeout: float | None = None,
     again_failed: str | None = None,
     accept_change: str | None = None,
     with_report: bool = True,
     live: bool = False,
     option: list[str] | None = None,
 ) -> Any:
-    stated: dict[str, Any] = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence}
-    stated |= {"seed": seed, "explore": explore, "within": within, "store": store, "options": named_values(option)}
-    settings = read_settings(target, stated)
+    stated = {"confidence": confidence, "explore": explore, "within": within, "options": named_values(option)}
+    settings = read_settings(target, {**vars(made), **vars(limits), **stated})
     settings = settings.certified_as({"resolution": resolution, "tests": tests, "quantile": quantile})
     experiment, certificate = settings.load(), settings.certificate_options
     if truth and experiment.truth is None:
         who = "Only experiments with a `truth` function have it, such as the cases of the paper"
         raise InputError(f"the true maximum of {experiment.name!r} is not known. {who}.")
-    limit, units = limit_of(experiment, settings), experiment.units
+    limit, total = limits.completed_by(settings, experiment)
     if envelope and limit is None:
         raise InputError("--envelope needs --threshold: it is the largest acceptable distance.")
     path = settings.store_path(experiment.name)
     campaign = settings.campaign(experiment, path, accept_change=accept_change)
-    total = budget_of(experiment, settings)
     if limit is not None:
         certificate.kind.require_usable(certificate.confidence, total)  # before executions are paid for
-    parts = experiment.validation
-    data = getattr(parts.model, "data", None)
-    learned = f" from {len(data)} transitions" if isinstance(data, Transitions) and len(data) else ""
-    system, model, synthesizer = (type(each).__name__ for each in (parts.system, parts.model, parts.synthesizer))
-    against = "" if limit is None else f", threshold {limit:g} {units}".rstrip()
-    sentence = f": S {system}, M {model}{learned}, controllers {synthesizer}{against}"
-    out.say((experiment.name, "bold"), sentence, wrap=True)
+    _print_parts(experiment, limit)
     with _live_page(live, ServedCampaign(experiment, campaign, limit, certificate, total), settings) as shown:
-        with _workers(workers, dask) as execution:
+        with _pool(parallel, dask) as pool:
             campaign.run(
                 total,
                 limit,
@@ -90,47 +80,24 @@ def run(
                 envelope=envelope,
                 within=settings.within,
                 certificate=certificate,
-                timeout=timeout,
                 again=again_failed,
-                **execution,
+                **pool,
             )
         known = experiment.truth() if truth and experiment.truth is not None else None
         digest = campaign.store.digest()
         verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
         bound = None if verdict is None else verdict.certificate
-        trusted = None
-        if envelope and limit is not None:
-            trusted = campaign.envelope(limit, certificate.confidence, certificate=certificate)
         if verdict is None and not settings.explores:
             with suppress(CertificateError):
                 bound = campaign.certify(certificate=certificate)
-        estimate, expected = campaign.estimate, None if verdict is None else verdict.expected
-        report: dict[str, Any] = {
-            "case": experiment.name,
-            **({"options": settings.options} if settings.options else {}),
-            "search": settings.search.name,
-            "seed": settings.seed,
-            "budget": total,
-            "executions": campaign.executions,
-            "failed": len(campaign.failed),
-            "failures": base.failures_of(campaign.failed),
-            "controllers": designs_sentence(campaign.trials),
-            "worst": base.worst_of(campaign.worst),
-            "estimate": estimate,
-            "interval": None if campaign.worst is None else [campaign.worst.distance, bound and bound.bound],
-            "units": units,
-            **(dict.fromkeys(("verdict", "reason", "rests_on", "threshold")) if verdict is None else verdict.to_json()),
-            "certificate": None if bound is None else bound.to_json(),
-            **({} if trusted is None else {"envelope": trusted.to_json()}),
-            "expected": None if expected is None else asdict(expected),
-            "store": str(path),
-            "other_stores": [str(other.path) for other in other_stores(path)],
-        }
-        if known is not None:
-            task = campaign.validation.space.describe_point(known.parameters.points)
-            missed = None if estimate is None else 100 * (known.distance - estimate) / known.distance
-            largest = {"distance": known.distance, "task": task, "method": known.method}
-            report |= {"truth": largest, "error_percent": missed}
+        report: dict[str, Any] = {"case": experiment.name, "search": settings.search.name, "seed": settings.seed}
+        report |= {"budget": total, "units": experiment.units, **_summary(campaign, verdict, bound, known)}
+        report |= {"store": str(path), "other_stores": [str(other.path) for other in other_stores(path)]}
+        report |= {"options": settings.options} if settings.options else {}
+        trusted = None
+        if envelope and limit is not None:
+            trusted = campaign.envelope(limit, certificate.confidence, certificate=certificate)
+            report["envelope"] = trusted.to_json()
         result = {"verdict": None if verdict is None else verdict.to_json(), "budget": total}
         if with_report:
             page = path.with_suffix(".report.html")
@@ -145,8 +112,55 @@ def run(
         campaign.store.keep_computed(base.RUN, {**result, "report": report.get("report")}, digest)
         if shown is not None:
             shown.end(verdict, bound, report.get("report"))
+    _print_result(campaign, report, verdict, bound, trusted)
+    if campaign.failed and not campaign.completed:
+        why = "`ctxval why` looks for a cause in what was recorded before the failures."
+        err.say(base.ERROR, f"all {len(campaign.failed)} executions failed, so there is no distance. {why}")
+        return report, base.CANNOT_GO_ON
+    return report, base.status_of(verdict)
+
+
+def _print_parts(experiment: Experiment, limit: float | None) -> None:
+    parts = experiment.validation
+    data = getattr(parts.model, "data", None)
+    learned = f" from {len(data)} transitions" if isinstance(data, Transitions) and len(data) else ""
+    system, model, synthesizer = (type(each).__name__ for each in (parts.system, parts.model, parts.synthesizer))
+    against = "" if limit is None else f", threshold {limit:g} {experiment.units}".rstrip()
+    sentence = f": S {system}, M {model}{learned}, controllers {synthesizer}{against}"
+    out.say((experiment.name, "bold"), sentence, wrap=True)
+
+
+def _summary(
+    campaign: Campaign, verdict: Verdict | None, bound: Certificate | None, known: Truth | None
+) -> dict[str, Any]:
+    unknown, estimate = dict.fromkeys(("verdict", "reason", "rests_on", "threshold")), campaign.estimate
+    expected = None if verdict is None else verdict.expected
+    summary = {
+        **base.summary_of(campaign.trials),
+        "controllers": designs_sentence(campaign.trials),
+        "estimate": estimate,
+        "interval": None if campaign.worst is None else [campaign.worst.distance, bound and bound.bound],
+        **(unknown if verdict is None else verdict.to_json()),
+        "certificate": None if bound is None else bound.to_json(),
+        "expected": None if expected is None else asdict(expected),
+    }
+    if known is not None:
+        task = campaign.validation.space.describe_point(known.parameters.points)
+        missed = None if estimate is None else 100 * (known.distance - estimate) / known.distance
+        largest = {"distance": known.distance, "task": task, "method": known.method}
+        summary |= {"truth": largest, "error_percent": missed}
+    return summary
+
+
+def _print_result(
+    campaign: Campaign,
+    report: dict[str, Any],
+    verdict: Verdict | None,
+    bound: Certificate | None,
+    trusted: Envelope | None,
+) -> None:
     if verdict is not None:
-        base.print_verdict(verdict, units)
+        base.print_verdict(verdict, report["units"])
     if trusted is not None:
         print_envelope(trusted)
     if verdict is None and bound is not None:
@@ -155,28 +169,22 @@ def run(
         out.say(f"{report['controllers']}.", wrap=True)
     base.print_failures(report["failures"])
     failed = f", of which {report['failed']} failed" if report["failed"] else ""
-    rows = {"executions": f"{report['executions']} of at most {total}{failed}"}
-    shown_keys = ("worst", "truth", "error_percent", "store", "report")
-    rows |= {key: report[key] for key in shown_keys if key in report}
+    rows = {"executions": f"{report['executions']} of at most {report['budget']}{failed}"}
+    rows |= {key: report[key] for key in ("worst", "truth", "error_percent", "store", "report") if key in report}
     if verdict is not None and verdict.answer == "falsified":
-        advice = [f"`{shlex.join(['ctxval', 'why', str(path)])}` tells what M lacks"]
-        if not envelope and campaign.recorder.search.uses_prediction:
+        advice = [f"`{shlex.join(['ctxval', 'why', report['store']])}` tells what M lacks"]
+        if trusted is None and campaign.recorder.search.uses_prediction:
             advice.append("the same command with --envelope finds where M holds")
         rows["next"] = "; ".join([*advice, "`ctxval refine` learns a better model"])
-    print_table(rows, units)
+    print_table(rows, report["units"])
     if verdict is not None:
         base.print_other_stores(report["other_stores"])
-    if campaign.failed and not campaign.completed:
-        why = "`ctxval why` looks for a cause in what was recorded before the failures."
-        err.say(base.ERROR, f"all {len(campaign.failed)} executions failed, so there is no distance. {why}")
-        return report, base.CANNOT_GO_ON
-    return report, base.status_of(verdict)
 
 
 @contextmanager
-def _workers(workers: int | None, dask: str | None) -> Iterator[dict[str, Any]]:
+def _pool(parallel: Parallel, dask: str | None) -> Iterator[dict[str, Any]]:
     if dask is None:
-        yield {"workers": workers}
+        yield vars(parallel)
         return
     distributed = require_extra("distributed", "dask", "--dask needs")
     with reworded(f"there is no Dask scheduler at {dask}"):
@@ -185,7 +193,8 @@ def _workers(workers: int | None, dask: str | None) -> Iterator[dict[str, Any]]:
         threads = sum(client.nthreads().values())
         if not threads:
             raise InputError(f"the Dask scheduler at {dask} has no workers.")
-        yield {"workers": workers or threads, "executor": client.get_executor(pure=False)}
+        executor = client.get_executor(pure=False)
+        yield {**vars(parallel), "workers": parallel.workers or threads, "executor": executor}
 
 
 @contextmanager

@@ -20,8 +20,8 @@ from ctxval.certificates import KINDS, CertificateOptions, assess
 from ctxval.certificates.envelope import Envelope
 from ctxval.cli import base
 from ctxval.cli.base import Allowed, command, named_values, out, print_table
-from ctxval.cli.config.settings import ExperimentSettings
-from ctxval.cli.config.stored_settings import budget_of, limit_of, open_store, planned_settings, trusted_settings
+from ctxval.cli.config.settings import CertificateTable, ExperimentSettings
+from ctxval.cli.config.stored_settings import Limits, open_store, planned_settings, trusted_settings
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.trial import Trials
 from ctxval.errors import CtxvalError, InputError, StoreAccessError, StoreError
@@ -40,23 +40,20 @@ def status(store: Path) -> Any:
             verdict = f"{answer} against {threshold:g}: {reason}"
     search = description.get("search")
     search = search.get("type") if isinstance(search, dict) else None
-    worst = base.worst_of(trials.worst)
+    without = {"unmeasured": trials.in_state("unmeasured").numbers, "open": trials.open.numbers}
     report: dict[str, Any] = {
         "case": description.get("name"),
         "search": search,
         "seed": description.get("seed"),
-        "executions": trials.executions,
-        "failed": len(trials.in_state("failed")),
-        "failures": base.failures_of(trials),
-        "unmeasured": trials.in_state("unmeasured").numbers,
-        "open": trials.open.numbers,
-        "worst": worst,
+        **base.summary_of(trials),
+        **without,
         "verdict": verdict,
         "thresholds": thresholds,
         "changes": [asdict(change) for change in changes],
         "store": str(store),
     }
-    print_table({key: value for key, value in report.items() if key not in ("failures", "thresholds", "changes")})
+    rows = ("case", "search", "seed", "executions", "failed", *without, "worst", "verdict", "store")
+    print_table({key: report[key] for key in rows})
     for stated in thresholds:
         known = counted(stated["distances"], "known distance")
         out.say(f"{stated['at'][:19]} threshold {stated['threshold']:g}: stated after {known}")
@@ -87,7 +84,7 @@ def export_store(store: Path, out_: Path | None = None, force: bool = False) -> 
 def remeasure(store: Path, allowed: Allowed) -> Any:
     before = {trial.number: trial.distance for trial in Store.existing(store).trials()}
     campaign = open_store(store, allowed, remeasure=True).campaign
-    trials, worst = campaign.trials, base.worst_of(campaign.worst)
+    trials, worst = campaign.trials, base.summary_of(campaign.trials)["worst"]
     measured = len(campaign.completed)
     changed = [trial.number for trial in trials if trial.distance != before.get(trial.number)]
     unmeasured = [trial.number for trial in campaign.unmeasured]
@@ -120,7 +117,7 @@ class Asked:
     option: list[str] | None = None
 
     def options(self, settings: ExperimentSettings, kind: str | None) -> CertificateOptions:
-        given = {name: getattr(self, name) for name in ("discard", "volume", "resolution", "tests", "quantile")}
+        given = {name: getattr(self, name) for name in CertificateTable.model_fields if name != "kind"}
         level = settings.confidence if self.confidence is None else self.confidence
         return settings.certificate.options(level, kind=kind, stated=named_values(self.option, **given))
 
@@ -197,8 +194,8 @@ def write_report(
         known: dict[str, Any] = {"missing": str(error), "labels": labels, "budget": settings.budget}
         context = reports.context_of_store(opened, limit, certificate=asked.options(settings, asked.kind), **known)
     else:
-        settings, limit = loaded.settings, limit_of(loaded.experiment, loaded.settings, asked.threshold)
-        options, budget = asked.options(settings, asked.kind), budget_of(loaded.experiment, settings)
+        limit, budget = Limits(asked.threshold).completed_by(loaded.settings, loaded.experiment)
+        options = asked.options(loaded.settings, asked.kind)
         context = reports.context_of_campaign(loaded.campaign, threshold=limit, certificate=options, budget=budget)
     written = {"report": str(reports.write_page(context, target))}
     if junit is not None:
@@ -225,7 +222,7 @@ def state_envelope(
     suffix = ".onnx" if out_ is not None and out_.suffix == ".onnx" else ".py"
     base.require_outputs({f"--out {suffix}": out_}, [store, allowed.experiment], force=force)
     loaded = open_store(store, allowed)
-    limit = limit_of(loaded.experiment, loaded.settings, threshold)
+    limit, _ = Limits(threshold).completed_by(loaded.settings, loaded.experiment)
     if limit is None:
         raise InputError("an envelope needs --threshold: it is the largest acceptable distance.")
     asked = Asked(confidence=confidence, tests=tests, quantile=quantile)

@@ -20,7 +20,7 @@ from ctxval.cli import base
 from ctxval.cli.base import Allowed, command, err, named_values, notes, out, print_columns, print_table, require_outputs
 from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.settings import ExperimentSettings, read_settings
-from ctxval.cli.config.stored_settings import budget_of, limit_of, open_target
+from ctxval.cli.config.stored_settings import Limits, open_target
 from ctxval.cli.recordings import StepFunction, print_parameters, require_model_file
 from ctxval.errors import CtxvalError, InputError
 from ctxval.specs import ReachAvoid
@@ -118,16 +118,14 @@ def refine_model(
     target: str,
     allowed: Allowed,
     function: StepFunction,
-    threshold: float | None = None,
-    budget: int | None = None,
+    limits: Limits,
+    parallel: base.Parallel,
     method: str = "residual",
     fit: str | None = None,
     out_: Path | None = None,
     force: bool = False,
     confidence: float | None = None,
     seed: int | None = None,
-    workers: int | None = None,
-    timeout: float | None = None,
     option: list[str] | None = None,
 ) -> Any:
     known = _method(method, fit, function)
@@ -139,13 +137,13 @@ def refine_model(
     settings = opened.settings
     if confidence is not None:
         settings = settings.model_copy(update={"confidence": confidence})
-    limit = limit_of(opened.experiment, settings, threshold)
+    limit, total = limits.completed_by(settings, opened.experiment)
     if limit is None:
         raise InputError("a refinement needs a threshold: give --threshold.")
     if out_ is not None:
         require_file_of(out_, chosen.name, chosen.makes, opened.campaign.validation.model, function.step)
-    if budget is None:
-        budget = opened.campaign.executions + budget_of(opened.experiment, settings)
+    if limits.budget is None:
+        total += opened.campaign.executions
 
     def open_round(validation: Validation, store: Path, model_file: Path, certificate: CertificateOptions) -> Campaign:
         """Return the campaign of a round, whose store names the experiment and the file of the model."""
@@ -156,12 +154,12 @@ def refine_model(
     refinement = refine(
         opened.campaign,
         limit,
-        budget,
+        total,
         method=chosen,
         certificate=settings.certificate_options,
         open_round=open_round,
-        workers=workers,
-        timeout=timeout,
+        workers=parallel.workers,
+        timeout=parallel.timeout,
     )
     _print_refinement(refinement)  # before the files are written, which may fail
     number = refinement.last.number
@@ -208,14 +206,13 @@ def _print_refinement(refinement: Refinement) -> None:
 @command()
 def safe(
     target: str,
+    parallel: base.Parallel,
     margin: float | None = None,
     budget: int | None = None,
     confidence: float | None = None,
     audit: int | None = None,
     seed: int | None = None,
     store: Path | None = None,
-    workers: int | None = None,
-    timeout: float | None = None,
     accept_change: str | None = None,
 ) -> Any:
     require("margin", PositiveFloat | None, margin)
@@ -237,13 +234,15 @@ def safe(
     share = require_safe_tasks(experiment.validation)
     again = _has_another_margin(path, settings)
     campaign = settings.campaign(experiment, path, accept_change=accept_change, remeasure=again)
-    total, certificate = budget_of(experiment, settings), settings.certificate_options
+    total, certificate = Limits().completed_by(settings, experiment)[1], settings.certificate_options
     units, wanted = experiment.units, f"{100 * share:.0f} % of the drawn tasks satisfy the specification on the model"
     if table.margin is not None:
         wanted += f" with the margin {table.margin:g} {units}".rstrip()
     out.say((experiment.name, "bold"), f": {wanted}", wrap=True)
     certificate.kind.require_usable(certificate.confidence, total)
-    campaign.run(total, table.margin, certificate=certificate, explore=False, workers=workers, timeout=timeout)
+    campaign.run(
+        total, table.margin, certificate=certificate, explore=False, workers=parallel.workers, timeout=parallel.timeout
+    )
     report, drawn = assess(campaign, certificate), None
     if audit is not None:
         least = report.d_b if report.d_b_bound is None else report.d_b_bound

@@ -96,10 +96,10 @@ class GoalMisses:
         return np.asarray(self.shares.max(axis=1) > MISSED)
 
     @property
-    def worst(self) -> tuple[int, int]:
-        """The task and the index in ``states`` with the largest share."""
+    def worst(self) -> tuple[int, int, float]:
+        """The task and the state with the largest share, and the error of this final state."""
         row, column = np.unravel_index(int(self.shares.argmax()), self.shares.shape)
-        return int(row), int(column)
+        return int(row), int(self.states[column]), float(self.misses[row, column])
 
 
 def goal_misses(validation: Validation, on_model: Sequence[Trajectory], goals: Sequence[Array]) -> GoalMisses | None:

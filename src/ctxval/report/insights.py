@@ -246,11 +246,11 @@ def goals(context: ReportContext) -> Answer | None:
     misses = soundness.goal_misses(context.validation, on_model, [context.replays[k].task.goal for k in numbers])
     if misses is None or not misses.missed.any():
         return None
-    missed, (row, j) = misses.missed, misses.worst
-    label, size = context.signals[0][int(misses.states[j])], float(misses.misses[row, j])
-    values = {"missed": int(missed.sum()), "trials": len(numbers), "largest_miss": size, "state": label}
+    missed, (row, state, size) = int(misses.missed.sum()), misses.worst
+    label = context.signals[0][state]
+    values = {"missed": missed, "trials": len(numbers), "largest_miss": size, "state": label}
     text = (
-        f"In {int(missed.sum())} of {len(numbers)} trials M ends farther than {percent(soundness.MISSED)} of the range "
+        f"In {missed} of {len(numbers)} trials M ends farther than {percent(soundness.MISSED)} of the range "
         f"of a weighted state from its goal; it misses most in {label}, by {number(size)}, in trial {numbers[row]}. A "
         "controller that fails on M cannot be expected to work on S."
     )

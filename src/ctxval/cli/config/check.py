@@ -121,9 +121,9 @@ def _goals(validation: Validation, plans: Sequence[Plan]) -> Findings:
         row, reached = int(np.argmax(errors)), max(errors) <= MISSED * max(starts)
         how = f"{errors[row]:.3g} from the goal (1-norm of the states)"
     else:
-        (row, column), reached = missed.worst, not missed.missed.any()
+        (row, state, size), reached = missed.worst, not missed.missed.any()
         names = labels_of(validation.names(on_model[0].states.shape[-1], on_model[0].inputs.shape[-1])[0])
-        how = f"{missed.misses[row, column]:.3g} from the goal in {names[int(missed.states[column])]}"
+        how = f"{size:.3g} from the goal in {names[state]}"
     text = f"ends at most {how}, at {task_text(validation.space.describe_point(plans[row].parameters.points))}"
     if not reached:
         text += "; a controller that fails on the model itself cannot be expected to work on the system: see --aspect1"

@@ -70,7 +70,7 @@ class CertificateTable(BaseModel, extra="allow"):
         if kind in (None, self.kind):
             planned, given = self.model_dump(), {**(self.model_extra or {}), **given}
         else:  # only those settings of the file hold that are not about one kind
-            planned = self.model_dump(include={"resolution", "volume", "tests", "quantile"})
+            planned = self.model_dump(include={"volume", *KINDS["auto"].options()})
         merged = {**planned, **require_types(f"certificate {chosen.name!r}", chosen, given)}
         return CertificateOptions(chosen.of(merged), confidence, merged["volume"])
 

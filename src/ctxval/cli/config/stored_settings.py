@@ -120,16 +120,19 @@ class Opened:
     path: Path
 
 
-def limit_of(experiment: Experiment, settings: ExperimentSettings, given: float | None = None) -> float | None:
-    """Return the threshold of the verdict: the given one, or else that of the settings, or else of the experiment."""
-    known = (value for value in (given, settings.threshold, experiment.threshold) if value is not None)
-    return require("threshold", PositiveFloat | None, next(known, None))  # type: ignore[no-any-return]
+@dataclass(frozen=True)
+class Limits:
+    """The threshold of a verdict, and the budget of executions; those of the settings or the experiment if None."""
 
+    threshold: float | None = None
+    budget: int | None = None
 
-def budget_of(experiment: Experiment, settings: ExperimentSettings, given: int | None = None) -> int:
-    """Return the budget: the given one, or else that of the settings, or else of the experiment."""
-    known = (value for value in (given, settings.budget, experiment.budget) if value is not None)
-    return require("budget", PositiveInt, next(known))  # type: ignore[no-any-return]
+    def completed_by(self, settings: ExperimentSettings, experiment: Experiment) -> tuple[float | None, int]:
+        """Return the threshold, which no one need have stated, and the budget."""
+        sources: tuple[Any, ...] = self, settings, experiment
+        threshold = next((each.threshold for each in sources if each.threshold is not None), None)
+        budget = next(each.budget for each in sources if each.budget is not None)
+        return require("threshold", PositiveFloat | None, threshold), require("budget", PositiveInt, budget)
 
 
 def open_store(path: Path, allowed: Allowed, *, remeasure: bool = False) -> Opened:

@@ -11,6 +11,7 @@ import platform
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,11 +22,9 @@ from markupsafe import Markup
 from ctxval._util.arrays import Array
 from ctxval._util.texts import enumerated
 from ctxval._util.version import VERSION
-from ctxval.certificates import RESOLUTION
+from ctxval.certificates import Automatic
 from ctxval.certificates.bounds import at_most, with_error
 from ctxval.certificates.options import CONFIDENCE, WITHIN
-from ctxval.certificates.prediction_tests import TESTS
-from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Trial
 from ctxval.report.context import ReportContext
 from ctxval.report.distance_model import distance_of
@@ -119,9 +118,7 @@ def run_command(settings: Mapping[str, Any], budget: int | None, *others: str, t
         "--budget": (budget, None),
         "--threshold": (settings.get("threshold"), None),
         "--confidence": (settings.get("confidence"), CONFIDENCE),
-        "--resolution": (certificate.get("resolution"), RESOLUTION),
-        "--tests": (certificate.get("tests"), TESTS),
-        "--quantile": (certificate.get("quantile"), QUANTILE),
+        **{f"--{option.name}": (certificate.get(option.name), option.default) for option in fields(Automatic)},
         "--within": (settings.get("within"), WITHIN),
     }
     for option, (value, default) in values.items():
