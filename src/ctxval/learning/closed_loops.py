@@ -232,10 +232,7 @@ def distances_of(draws: Draws, loops: Sequence[Loops], planned: Sequence[Planned
 
 
 def loop_pairs(planner: LoopPlanner, posterior: AnyPosterior, tasks: Array) -> Array:
-    """Return the standardised pairs ``(N, k)`` that the mean's closed loops on tasks visit, without those far away.
-
-    There are none if draws have no pivots that could be chosen from them.
-    """
+    """Return standardised pairs ``(N, k)`` that the mean's loops on tasks visit, none far away or without pivots."""
     parts = [np.empty((0, posterior.data.pairs.shape[1]))]
     for loops in planner.run(posterior.mean, planner.plan(tasks) if posterior.has_pivots else []):
         visited = posterior.data.standardised(loops.states[..., :-1, :], loops.inputs)

@@ -104,7 +104,8 @@ class DynamicsDraws(DrawsWithoutNoise):
     def step(self, x: Array, u: Array) -> Array:
         """Return the next states; see :class:`DrawsWithoutNoise`."""
         shape = x.shape
-        x, u = of_draws(x, len(self)), of_draws(u, len(self))
+        of_each = math.prod(shape[:-1]) // len(self)
+        x, u = (part.reshape(len(self), of_each, part.shape[-1]) for part in (x, u))  # there may be no inputs
         with np.errstate(all="ignore"):
             z = bounded(self.data.standardised(x, u))
             parts = np.split(z, np.cumsum([len(each.weights) for each in self.expansions[:-1]], dtype=int))
@@ -134,14 +135,9 @@ class DisturbedDynamics(DrawsWithoutNoise):
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next states; see :class:`DrawsWithoutNoise`."""
-        together = of_draws(x, len(self))
+        together = x.reshape(len(self), math.prod(x.shape[:-1]) // len(self), x.shape[-1])
         moved = self.mean.step(x, u).reshape(together.shape) + self.added(self.ways, together)
         return np.asarray(moved.reshape(x.shape))
-
-
-def of_draws(rows: Array, draws: int) -> Array:
-    """Return vectors ``(..., k)``, as many of each draw, with draws as first of two axes; k may be 0."""
-    return rows.reshape(draws, math.prod(rows.shape[:-1]) // draws, rows.shape[-1])
 
 
 def bounded(z: Array) -> Array:

@@ -187,7 +187,7 @@ class NoisyPosterior(ShortRepr):
 
     def with_noise(self, runs: int, least: Array) -> NoisyDraws | None:
         """Return the mean; None if all deviations are at most those that are given, ``(n,)``."""
-        return self.mean if (np.maximum(self.fit.noise, self.scatter) > least).any() else None
+        return self.mean if ((self.fit.noise > least) | (self.scatter > least)).any() else None
 
     def draw(
         self,
