@@ -239,10 +239,7 @@ class DynamicsPosterior(ShortRepr):
         return deviations
 
     def with_noise(self, runs: int, least: Array) -> DisturbedDynamics | None:
-        """Return the mean with white noise as large as was learned, in so many ``runs``.
-
-        It is None if all deviations are at most those that are given, ``(n,)``.
-        """
+        """Return the mean with white noise, so many times; None if all its deviations are at most these ``(n,)``."""
         deviations = self.deviations
 
         def noise(ways: Rows, x: Array) -> Array:
