@@ -15,19 +15,17 @@ from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import moves_to_bounds
 from ctxval._util.progress import advance
 from ctxval.core.controller import Controller, ControllerWithMemory, started
-from ctxval.core.model import Step
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.errors import DistanceError
-from ctxval.learning.draws import DisturbedDynamics, DynamicsDraws
+from ctxval.learning.draws import Draws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
-from ctxval.learning.noisy_draws import NoisyDraws, NoisyRuns
+from ctxval.learning.noisy_draws import NoisyPosterior
 
 T = TypeVar("T")
-AnyDraws = DynamicsDraws | NoisyDraws  # without and with noise
-Together = AnyDraws | DisturbedDynamics  # systems that are run together
+AnyPosterior = DynamicsPosterior | NoisyPosterior  # of dynamics without and with noise
 
 _UNITS = "closed loops", "designs", "tasks"  # of stages that closed loops are progress of
 _REMEMBERED = 64_000_000  # largest size of the plans that are kept, in bytes, approximately
@@ -125,80 +123,43 @@ class LoopPlanner:
             raise ValueError("the task function did not return one task for each point")
         return PlannedTasks(rows, task, controller, promised)
 
-    def run(self, draws: Together, planned: Sequence[PlannedTasks]) -> list[Loops]:
+    def run(self, draws: Draws, planned: Sequence[PlannedTasks]) -> list[Loops]:
         """Return the closed loops of all draws on the same tasks."""
-        if isinstance(draws, NoisyDraws):
-            of_run, replicates = np.divmod(np.arange(len(draws) * draws.replicates), draws.replicates)
-            of_draws = (np.broadcast_to(of_run[:, None], (len(of_run), len(plan.rows))) for plan in planned)
-            return [self._noisy_loops(draws, *pair, replicates) for pair in zip(planned, of_draws, strict=True)]
-        S, runs = len(draws), []
+        runs, sizes = len(draws) * draws.replicates, [len(plan.rows) for plan in planned]
+        rows = (np.arange(runs * size).reshape(runs, size) for size in sizes)
+        return [self._loops(draws, *each) for each in zip(planned, rows, sizes, strict=True)]
 
-        def of_one_task(x: Array, u: Array) -> Array:
-            return np.asarray(draws.step(x[:, None], u[:, None])[:, 0])
-
-        for plan in planned:
-            task = plan.task
-            if self._takes_draws_together(plan, S):
-                start = np.repeat(task.initial_state[None], S, axis=0)
-                step: Step = draws.step if task.batch_shape else of_one_task
-                together = rollout(step, plan.controller, task.starting_at(start))
-                loops = [Trajectory(together.times, together.states[s], together.inputs[s]) for s in range(S)]
-            else:
-                loops = [rollout(draws[s].step, plan.controller, task) for s in range(S)]
-            runs.append(self._stacked(plan, loops))
-        return runs
-
-    def distances(self, draws: Together, planned: Sequence[PlannedTasks], tasks: int) -> Array:
+    def distances(self, draws: Draws, planned: Sequence[PlannedTasks], tasks: int) -> Array:
         """Return the distances ``(S, q)`` of all draws on the same q tasks; NaN for a task without a finite plan."""
         distances = distances_of(draws, self.run(draws, planned), planned, tasks)
         advance(len(draws) * sum(len(plan.rows) for plan in planned), units=_UNITS)
         return distances
 
-    def own_distances(self, draws: AnyDraws, points: Array) -> Array:
+    def own_distances(self, draws: Draws, points: Array) -> Array:
         """Return the distances ``(S, q)`` of each draw on tasks of its own, at points ``(S, q, d)``."""
-        S, q, d = points.shape
-        R = draws.replicates if isinstance(draws, NoisyDraws) else 1
-        distances = np.full((R, S * q), np.nan)
+        (S, q, d), R = points.shape, draws.replicates
+        distances = np.full(S * R * q, np.nan)
+        # One row for each sequence of noise, with the tasks of all draws.
+        rows = np.arange(S * R * q).reshape(S, R, q).swapaxes(0, 1).reshape(R, S * q)
         for plan in self.plan(points.reshape(S * q, d), together=S * q):
-            if isinstance(draws, NoisyDraws):
-                of_draw = np.broadcast_to(plan.rows // q, (R, len(plan.rows)))
-                distances[:, plan.rows] = self._noisy_loops(draws, plan, of_draw, np.arange(R)).distances
-            else:
-                first, last = int(plan.rows[0]) // q, int(plan.rows[-1]) // q + 1
-                needed, here = draws[np.arange(first, last)], plan.rows - first * q
+            some = rows[:, plan.rows]
+            distances[some] = self._loops(draws, plan, some, q).distances
+            advance(some.size, units=_UNITS)
+        return draws.reduced(distances.reshape(S * R, q))
 
-                def step(x: Array, u: Array, needed: DynamicsDraws = needed, here: Rows = here) -> Array:
-                    # A flat batch has some rows of all tasks of these draws.
-                    whole = [np.zeros((len(needed) * q, part.shape[-1])) for part in (x, u)]
-                    whole[0][here], whole[1][here] = x, u
-                    after = needed.step(*(part.reshape(len(needed), q, -1) for part in whole))
-                    return np.asarray(after.reshape(-1, x.shape[-1])[here])
-
-                of_tasks = step if plan.task.batch_shape else draws[first].step
-                distances[0, plan.rows] = self.compared(plan, rollout(of_tasks, plan.controller, plan.task))
-            advance(R * len(plan.rows), units=_UNITS)
-        of_loops = distances.reshape(R, S, q).swapaxes(0, 1).reshape(S * R, q)
-        return draws.reduced(of_loops) if isinstance(draws, NoisyDraws) else of_loops
-
-    def _noisy_loops(self, draws: NoisyDraws, planned: PlannedTasks, of_draw: Rows, replicates: Rows) -> Loops:
-        """Return closed loops of draws ``(L, q)`` with a sequence of noise for each row, ``(L,)``."""
-        task, L = planned.task, len(replicates)
-        of_replicate = np.broadcast_to(replicates[:, None], of_draw.shape)
+    def _loops(self, draws: Draws, planned: PlannedTasks, rows: Rows, tasks: int) -> Loops:
+        """Return closed loops of draws; ``rows`` ``(L, q)`` says which, of all with so many tasks for each system."""
+        task, L = planned.task, len(rows)
+        rows = rows.reshape(L, *task.batch_shape)
         if self._takes_draws_together(planned, L):
-            start = np.repeat(task.initial_state[None], L, axis=0)
-            runs = NoisyRuns(draws, of_draw, of_replicate, start)
-            together = rollout(runs.step, planned.controller, task.starting_at(runs.first))
+            first, step = draws.begun(rows, tasks, np.repeat(task.initial_state[None], L, axis=0))
+            together = rollout(step, planned.controller, task.starting_at(first))
             loops = [Trajectory(together.times, together.states[k], together.inputs[k]) for k in range(L)]
         else:
-            loops = []
-            for k in range(L):
-                runs = NoisyRuns(draws, of_draw[k], of_replicate[k], task.initial_state)
-                loops.append(rollout(runs.step, planned.controller, task.starting_at(runs.first)))
-        return self._stacked(planned, loops)
-
-    def _stacked(self, planned: PlannedTasks, loops: Sequence[Trajectory]) -> Loops:
+            alone = (draws.begun(each, tasks, task.initial_state) for each in rows)
+            loops = [rollout(step, planned.controller, task.starting_at(first)) for first, step in alone]
         states, inputs = np.stack([loop.states for loop in loops]), np.stack([loop.inputs for loop in loops])
-        shape = (len(loops), len(planned.rows))
+        shape = L, len(planned.rows)
         distances = np.array([self.compared(planned, loop) for loop in loops]).reshape(shape)
         return Loops(distances, *(part.reshape(*shape, *part.shape[-2:]) for part in (states, inputs)))
 
@@ -262,19 +223,18 @@ def halved(function: Callable[[Rows], T], count: int) -> list[tuple[Rows, T | No
     return results
 
 
-def distances_of(draws: Together, loops: Sequence[Loops], planned: Sequence[PlannedTasks], tasks: int) -> Array:
+def distances_of(draws: Draws, loops: Sequence[Loops], planned: Sequence[PlannedTasks], tasks: int) -> Array:
     """Return the distances ``(S, q)`` of closed loops of S draws on planned tasks; NaN for a task without a plan."""
     distances = np.full((len(draws), tasks), np.nan)
     for plan, of_batch in zip(planned, loops, strict=True):
-        each = of_batch.distances
-        distances[:, plan.rows] = draws.reduced(each) if isinstance(draws, NoisyDraws) else each
+        distances[:, plan.rows] = draws.reduced(of_batch.distances)
     return distances
 
 
-def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> Array:
-    """Return the standardised pairs ``(N, k)`` that the mean's closed loops on tasks visit, without those far away."""
+def loop_pairs(planner: LoopPlanner, posterior: AnyPosterior, tasks: Array) -> Array:
+    """Return standardised pairs ``(N, k)`` that the mean's loops on tasks visit, none far away or without pivots."""
     parts = [np.empty((0, posterior.data.pairs.shape[1]))]
-    for loops in planner.run(posterior.mean, planner.plan(tasks)):
+    for loops in planner.run(posterior.mean, planner.plan(tasks) if posterior.has_pivots else []):
         visited = posterior.data.standardised(loops.states[..., :-1, :], loops.inputs)
         parts.append(visited.reshape(-1, visited.shape[-1]))
     pairs = np.concatenate(parts)

@@ -2,21 +2,81 @@
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Self
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, Rows, rows_of
+from ctxval._util.arrays import Array, ArrayLike, Rows
 from ctxval._util.representation import ShortRepr
-from ctxval.core.model import Model
+from ctxval.core.model import Model, Step
 from ctxval.learning.kernel_expansion import KernelExpansion
 from ctxval.learning.residual_data import ResidualData
 
 
+class Draws(ShortRepr, ABC):
+    """S systems, with R sequences of noise each, whose closed loops are run together."""
+
+    replicates = 1  # the number R, 1 without noise
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def __getitem__(self, rows: ArrayLike) -> Self:
+        """Return some draws; their rows are in ascending order."""
+
+    @abstractmethod
+    def begun(self, rows: Rows, tasks: int, start: Array) -> tuple[Array, Step]:
+        """Return the first states of closed loops that start at states ``(..., n)``, and the step of all of them.
+
+        The S R systems, draw after draw, have a loop on each of so many ``tasks``; these are ascending rows ``(...)``.
+        """
+
+    @property
+    def searched(self) -> Self:
+        """The same with fewer sequences of noise, with which a search finds the same tasks."""
+        return self
+
+    def without_noise(self) -> Self:
+        """Return the same without noise."""
+        return self
+
+    def settled(self, rng: np.random.Generator) -> Self | None:
+        """Return the same with more sequences of noise, for tasks that a search has found; None without noise."""
+
+    def reduced(self, distances: Array) -> Array:
+        """Return the distances ``(S, q)`` of draws from those of all systems ``(S R, q)``."""
+        return distances
+
+
+class DrawsWithoutNoise(Draws):
+    """Systems whose next states follow from states and inputs."""
+
+    @abstractmethod
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next states, ``(..., n), (..., m) -> (..., n)``, equally many of each draw, draw after draw."""
+
+    def begun(self, rows: Rows, tasks: int, start: Array) -> tuple[Array, Step]:
+        """Return the states, and the step of those draws; see :meth:`Draws.begun`."""
+        first, last = int(rows.min()) // tasks, int(rows.max()) // tasks + 1
+        needed, here = self[np.arange(first, last)], rows.ravel() - first * tasks
+
+        def step(x: Array, u: Array) -> Array:
+            # A flat batch has some rows of all tasks of these draws.
+            whole = [np.zeros((len(needed) * tasks, part.shape[-1])) for part in (x, u)]
+            whole[0][here], whole[1][here] = x, u
+            return np.asarray(needed.step(*whole)[here])
+
+        return start, needed.step if start.ndim == 1 or len(here) == len(needed) * tasks else step
+
+
 @dataclass(frozen=True, eq=False)
-class DynamicsDraws(ShortRepr):
+class DynamicsDraws(DrawsWithoutNoise):
     """S models ``M + r_s``, run together: a draw is the first axis of states and inputs; a single draw is a model."""
 
     model: Model
@@ -29,7 +89,7 @@ class DynamicsDraws(ShortRepr):
     def __len__(self) -> int:
         return sum(len(expansion.weights) for expansion in self.expansions)
 
-    def __getitem__(self, rows: ArrayLike) -> DynamicsDraws:
+    def __getitem__(self, rows: ArrayLike) -> Self:
         """Return some draws; their rows are in ascending order."""
         rows = np.atleast_1d(np.asarray(rows, dtype=np.intp))
         if not (rows < len(self)).all():
@@ -42,10 +102,10 @@ class DynamicsDraws(ShortRepr):
         return replace(self, expansions=kept)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``; of a single draw ``(..., n)``."""
+        """Return the next states; see :class:`DrawsWithoutNoise`."""
         shape = x.shape
-        if len(self) == 1:
-            x, u = rows_of(x)[None], rows_of(u)[None]
+        of_each = math.prod(shape[:-1]) // len(self)
+        x, u = (part.reshape(len(self), of_each, part.shape[-1]) for part in (x, u))  # there may be no inputs
         with np.errstate(all="ignore"):
             z = bounded(self.data.standardised(x, u))
             parts = np.split(z, np.cumsum([len(each.weights) for each in self.expansions[:-1]], dtype=int))
@@ -58,7 +118,7 @@ class DynamicsDraws(ShortRepr):
 
 
 @dataclass(frozen=True, eq=False)
-class DisturbedDynamics(ShortRepr):
+class DisturbedDynamics(DrawsWithoutNoise):
     """One model, to whose next states something is added, in several ways that are run together as draws are."""
 
     mean: DynamicsDraws  # the model, as the only draw
@@ -69,13 +129,13 @@ class DisturbedDynamics(ShortRepr):
     def __len__(self) -> int:
         return len(self.ways)
 
-    def __getitem__(self, rows: ArrayLike) -> DisturbedDynamics:
+    def __getitem__(self, rows: ArrayLike) -> Self:
         """Return some of the ways."""
         return replace(self, ways=self.ways[np.atleast_1d(rows)])
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``; of a single way ``(..., n)``."""
-        together = x if len(self) > 1 else rows_of(x)[None]
+        """Return the next states; see :class:`DrawsWithoutNoise`."""
+        together = x.reshape(len(self), math.prod(x.shape[:-1]) // len(self), x.shape[-1])
         moved = self.mean.step(x, u).reshape(together.shape) + self.added(self.ways, together)
         return np.asarray(moved.reshape(x.shape))
 

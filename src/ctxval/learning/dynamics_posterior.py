@@ -13,6 +13,7 @@ import functools
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 from ctxval.gp.cholesky import factorise, pivoted_rows
-from ctxval.learning.draws import DynamicsDraws, bounded
+from ctxval.learning.draws import DisturbedDynamics, DynamicsDraws, bounded
 from ctxval.learning.hyperparameters import (
     FAMILIES,
     SMOOTHER_FAMILIES,
@@ -80,6 +81,8 @@ class DynamicsPosterior(ShortRepr):
     covariances: LearnedCovariances
     data: ResidualData
 
+    has_pivots: ClassVar[bool] = True  # whether draws are exact at some of the pairs that closed loops visit
+
     def functions_for(self, draws: int) -> int:
         """Return the number of functions for each draw of the hyperparameters that gives at least so many draws."""
         return max(self.covariances.settings.functions, -(-draws // len(self.components)))
@@ -135,8 +138,6 @@ class DynamicsPosterior(ShortRepr):
     def mean(self) -> DynamicsDraws:
         """The model plus the posterior mean of r for the most probable hyperparameters, as one draw."""
         return self._limited(self.most_probable.mean)
-
-    silent = searched = property(lambda self: self.mean)  # those of a NoisyPosterior: it has no noise
 
     @functools.cached_property
     def rough_mean(self) -> DynamicsDraws:
@@ -236,6 +237,18 @@ class DynamicsPosterior(ShortRepr):
         data, deviations = self.data, np.zeros(len(self.data.sizes))
         deviations[data.learned] = self.most_probable.noise * data.sizes[data.learned]
         return deviations
+
+    def with_noise(self, runs: int, least: Array) -> DisturbedDynamics | None:
+        """Return the mean with white noise, so many times; None if all its deviations are at most these ``(n,)``."""
+        deviations = self.deviations
+
+        def noise(ways: Rows, x: Array) -> Array:
+            # The noise is a function of the states, so that a loop is the same each time.
+            seed = np.frombuffer(np.ascontiguousarray(x).tobytes()[-64:], dtype=np.uint32)
+            rng = np.random.default_rng([int(ways[0]), *seed.tolist()])
+            return np.asarray(deviations * rng.standard_normal(x.shape))
+
+        return DisturbedDynamics(self.mean, np.arange(runs), noise) if (deviations > least).any() else None
 
     @property
     def noise(self) -> float:

@@ -147,7 +147,7 @@ class DynamicsStudy(ShortRepr):
             split = split_transitions(model, *recorded, seed, settings)
             if split is not None and (parts := split.posterior()) is not None:
                 points, loops = np.array([point for point, _ in extended]), [loop for _, loop in extended]
-                return LearnedDynamics(self, parts[0], points, loops, with_data, split, parts[1]).with_noisy(None)
+                return LearnedDynamics(self, parts[0], points, loops, with_data, split, parts[1])
         return None
 
     def _learn(self, executed: Executed, logged: Sequence[Trajectory], *, with_data: bool) -> LearnedDynamics | None:
@@ -193,7 +193,11 @@ class DynamicsStudy(ShortRepr):
         if posterior is None or not np.isfinite(posterior.most_probable.weights).all():
             return None
         points = np.array([point for point, _ in executed]).reshape(-1, self.validation.space.dimension)
-        return LearnedDynamics(self, posterior, points, [trajectory for _, trajectory in executed], with_data)
+        loops = [trajectory for _, trajectory in executed]
+        return LearnedDynamics(
+            self, posterior, points, loops, with_data,
+            learn_noisy=lambda: self.noise.learn(posterior, self.extended.records(executed)),
+        )  # fmt: skip
 
     @functools.cached_property
     def noise(self) -> NoiseStudy:
@@ -206,11 +210,11 @@ class DynamicsStudy(ShortRepr):
         kept = executed[:k] + executed[k + 1 :]
         recorded = self._recorded(kept, (), learned.with_data)
         others = self._conditioned(learned.posterior.covariances, recorded, kept, learned.with_data)
-        if others is None or noisy is None:
-            return others and others.with_noisy(None)
-        records, of_others = self.extended.records(executed), self.extended.records(kept)
-        again = self.noise.again(noisy, records, others.posterior, of_others)
-        return None if again is None else others.with_noisy(again)
+        if others is None:
+            return None
+        records = self.extended.records
+        again = noisy and self.noise.again(noisy, records(executed), others.posterior, records(kept))
+        return None if noisy and again is None else replace(others, learn_noisy=lambda: again)
 
     def with_states(self, executed: Executed, point: Array, trajectory: Trajectory) -> Trajectory | None:
         """Return a later execution of a task ``(d,)`` with the states that are learned; None without estimates."""
@@ -238,46 +242,47 @@ class DynamicsStudy(ShortRepr):
             self._others[name] = DynamicsStudy(given, self.seed, self.quantile, self.extended.of(given))
         return self._others[name]
 
-    def _found_actuator(self, executed: Executed, learned: LearnedDynamics | None = None) -> Actuator | None:
-        """Return a delay and a lag of inputs that explain the errors of predictions, those of ``learned`` if known."""
-        some = scheduled(len(executed))
-        if self.actuator is not None or some < _FEWEST_AGAINST:
-            return None
-        key = digest(trajectory for _, trajectory in executed[:some])
-        if key not in self._actuators:
-            estimated = self.given.outputs is not None
-            # Estimates of states cost as much as hundreds of steps, so the latest few executions have to suffice.
-            among = executed[max(0, some - 5) : some] if estimated else executed[:some]
-            inputs = among[0][1].inputs.shape[-1]
-
-            plain: list[Record] = []  # if states are recorded, they are the same with every actuator
-
-            def records_of(actuator: Actuator) -> list[Record]:
-                if plain:
-                    commanded = [trajectory.inputs for _, trajectory in among]
-                    alike = len({u.shape for u in commanded}) == 1
-                    acting = actuator.acting(np.stack(commanded)) if alike else map(actuator.acting, commanded)
-                    return [replace(record, inputs=u) for record, u in zip(plain, acting, strict=True)]
-                extended = ExtendedValidation(self.given, actuator, inputs)
-                known = extended.executions(among, len(among))
-                if known is None:
-                    raise np.linalg.LinAlgError
-                records = extended.records(known)
-                plain.extend(() if estimated else records)
-                return records
-
-            before, self._actuators[key] = self._found_actuator(executed[: some - 1]), None
-            if before is None:
-                if learned is None or some < len(executed):
-                    extended = self.extended.executions(executed[:some])
-                    learned = None if extended is None else self._learn(extended, (), with_data=True)
+    def _found_actuator(self, executed: Executed, learned: LearnedDynamics) -> Actuator | None:
+        """Return a delay and a lag of inputs that explain the errors of predictions; one that is found is refined."""
+        found = None
+        counts = range(_FEWEST_AGAINST, len(executed) + 1) if self.actuator is None else ()
+        for some in (executed[:count] for count in counts if scheduled(count) == count):
+            key = digest(trajectory for _, trajectory in some)
+            if key not in self._actuators:
+                self._actuators[key] = None  # also if its search fails
+                known: LearnedDynamics | None = learned
+                if found is None and len(some) < len(executed):
+                    extended = self.extended.executions(some)
+                    known = None if extended is None else self._learn(extended, (), with_data=True)
                 # Left-out error below which nobody asks whether inputs act late.
-                if learned is None or not learned.left_out_error > 0.02:
-                    return None
-            model = before_refinement(self.validation.model)
-            with single_threaded(), np.errstate(all="ignore"):
-                self._actuators[key] = found_actuator(model, records_of, before, 30 if estimated else 80)
-        return self._actuators[key]
+                if found is not None or (known is not None and known.left_out_error > 0.02):
+                    self._actuators[key] = self._search_actuator(some, found)
+            found = self._actuators[key]
+        return found
+
+    def _search_actuator(self, executed: Executed, before: Actuator | None) -> Actuator | None:
+        estimated = self.given.outputs is not None
+        # Estimates of states cost as much as hundreds of steps, so the latest few executions have to suffice.
+        among = executed[-5:] if estimated else executed
+        commanded = [trajectory.inputs for _, trajectory in among]
+        alike = len({u.shape for u in commanded}) == 1
+
+        def with_inputs(actuator: Actuator) -> list[Record]:
+            acting = actuator.acting(np.stack(commanded)) if alike else map(actuator.acting, commanded)
+            return [replace(record, inputs=u) for record, u in zip(plain, acting, strict=True)]
+
+        def estimated_with(actuator: Actuator) -> list[Record]:
+            extended = ExtendedValidation(self.given, actuator, commanded[0].shape[-1])
+            known = extended.executions(among, len(among))
+            if known is None:
+                raise np.linalg.LinAlgError
+            return extended.records(known)
+
+        # If states are recorded, they are the same with every actuator.
+        plain = [] if estimated else estimated_with(Actuator())
+        model, records_of = before_refinement(self.validation.model), estimated_with if estimated else with_inputs
+        with single_threaded(), np.errstate(all="ignore"):
+            return found_actuator(model, records_of, before, 30 if estimated else 80)
 
     def _most_telling(self, executed: Executed) -> tuple[str | None, float, float]:
         """Return the task parameter with which predictions err least, and the left-out errors with it and without."""

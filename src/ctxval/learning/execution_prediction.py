@@ -14,7 +14,8 @@ from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.representation import ShortRepr
 from ctxval.core.quantiles import LEVELS, chance_of_more
 from ctxval.core.trajectory import Trajectory
-from ctxval.learning.closed_loops import AnyDraws, LoopPlanner
+from ctxval.learning.closed_loops import LoopPlanner
+from ctxval.learning.draws import Draws
 
 _QUANTILES = np.linspace(0.0, 1.0, 21)  # levels of the stored quantiles of the distance
 
@@ -143,12 +144,10 @@ def _deviation(states: Array, medians: Array, deviations: Array, ranges: Array) 
 
 def predict_execution(
     planner: LoopPlanner,
-    draws: AnyDraws,
+    draws: Draws,
     point: Array,
     learned_from: int,
     recorded: Callable[[Trajectory], Trajectory] = lambda trajectory: trajectory,
-    *,
-    noisy: bool = False,
 ) -> ExecutionPrediction | None:
     """Return the prediction of the execution of a task ``(d,)`` as it is recorded; None if it cannot be planned."""
     planned = planner.plan(point[None])
@@ -165,7 +164,7 @@ def predict_execution(
     good, values = (states[kept], distances[kept]) if kept.any() else (np.zeros_like(states), np.zeros(len(states)))
     medians, deviations = np.median(good, axis=0), good.std(axis=0)
     noise, kept_distances = None, np.where(kept, distances, np.inf)
-    if noisy and kept.any():
+    if draws.replicates > 1 and kept.any():
         whole = loops[kept]
         roughness = np.sqrt((np.diff(whole, 2, axis=1) ** 2).mean(axis=(0, 1)))
         ranges = np.maximum(np.ptp(medians, axis=0), 1e-9)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ from ctxval.core.coverage import StateInputCoverage, StatePocket, UntriedParamet
 from ctxval.core.labels import labels_of
 from ctxval.core.learned_numbers import PushedDistances
 from ctxval.core.trajectory import Trajectory
-from ctxval.learning.closed_loops import AnyDraws, distances_of, loop_pairs
+from ctxval.learning.closed_loops import AnyPosterior, distances_of, loop_pairs
 from ctxval.learning.coverage import (
     away_from_executions,
     beyond_records,
@@ -24,9 +24,10 @@ from ctxval.learning.coverage import (
     largest_pocket,
     position_states,
 )
+from ctxval.learning.draws import Draws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
-from ctxval.learning.noisy_draws import SETTLED, NoisyDraws, NoisyPosterior
+from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.regular import Boundary, RegularTransitions
 from ctxval.learning.tolerance import push_response
 from ctxval.learning.worst_case import WorstCase
@@ -49,9 +50,11 @@ class LearnedDynamics(ShortRepr):
     # if only regular transitions are learned from: all of them, and where the regular part ends
     split: RegularTransitions | None = None
     boundary: Boundary | None = None
+    # learns the dynamics with noise; by default, there are none
+    learn_noisy: Callable[[], NoisyPosterior | None] = field(default=lambda: None, repr=False)
 
     _worst_cases: dict[int, WorstCase] = field(default_factory=dict, init=False)
-    _draws: dict[tuple[int, bool], AnyDraws] = field(default_factory=dict, init=False)
+    _draws: dict[tuple[int, bool], Draws] = field(default_factory=dict, init=False)
 
     @property
     def executions(self) -> list[tuple[Array, Trajectory]]:
@@ -64,16 +67,10 @@ class LearnedDynamics(ShortRepr):
         if not len(self.executed):
             return None
         with single_threaded():
-            return self.study.noise.learn(self.posterior, self.study.extended.records(self.executions))
-
-    def with_noisy(self, noisy: NoisyPosterior | None) -> LearnedDynamics:
-        """Return the same with dynamics with noise that were learned otherwise, or without noise."""
-        other = replace(self)
-        vars(other)["noisy"] = noisy  # where functools keeps what the property would compute
-        return other
+            return self.learn_noisy()
 
     @property
-    def drawn_from(self) -> DynamicsPosterior | NoisyPosterior:
+    def drawn_from(self) -> AnyPosterior:
         """The posterior of which draws bound d*."""
         return self.noisy or self.posterior
 
@@ -120,7 +117,7 @@ class LearnedDynamics(ShortRepr):
     def without(self, rows: Collection[int]) -> LearnedDynamics | None:
         """Return what the regular transitions of the other executions teach; None if it is nothing."""
         parts = None if self.split is None else self.split.posterior(rows)
-        return None if parts is None else replace(self, posterior=parts[0], boundary=parts[1]).with_noisy(None)
+        return None if parts is None else replace(self, posterior=parts[0], boundary=parts[1])
 
     def drawn_distances(
         self, points: Array, draws: int, *, settled: bool = True
@@ -144,11 +141,11 @@ class LearnedDynamics(ShortRepr):
                 rng = self._rng(6)
                 some = search.pool[rng.permutation(len(search.pool))[:64]]
                 drawn = self.drawn_from.draw(search.relevant(self.drawn_from, some, rng), rng, functions)
-                if settled and isinstance(drawn, NoisyDraws):
-                    drawn = drawn.with_replicates(SETTLED, rng)
-                self._draws[key] = drawn
+                many = drawn.settled(rng) if settled else None
+                self._draws[key] = drawn if many is None else many
             values = planner.distances(self._draws[key], planned, len(points))
-            of_pool, loops = (planner.run(self.drawn_from.silent, plans) for plans in (search.plans, planned))
+            silent = self.drawn_from.mean.without_noise()
+            of_pool, loops = planner.run(silent, search.plans), planner.run(silent, planned)
             beyond, away, crossed = np.full(len(points), np.inf), np.zeros(len(points)), np.ones(len(points))
             boundary = self.boundary
             all_beyond = beyond_records(self.posterior, of_pool, loops, executed_only=boundary is not None)
@@ -269,25 +266,21 @@ class LearnedDynamics(ShortRepr):
         """The distances of the pool's tasks on the posterior mean, and the coverage of their closed loops."""
         search, planner = self.study.search, self.study.planner
         with single_threaded():
-            searched, silent = self.drawn_from.searched, self.drawn_from.silent
-            loops = planner.run(silent, search.plans)
-            noisy = loops if searched is silent else planner.run(searched, search.plans)
+            searched = self.drawn_from.mean.searched
+            loops = planner.run(self.drawn_from.mean.without_noise(), search.plans)
+            noisy = loops if searched.replicates == 1 else planner.run(searched, search.plans)
             (distances,) = distances_of(searched, noisy, search.plans, len(search.pool))
             return distances, coverage(self.posterior, search.pool, search.plans, loops, self.labels)
 
     def predict(self, point: Array) -> ExecutionPrediction | None:
         """Return the prediction of the execution of a task, a point ``(d,)``; None if it cannot be planned."""
-        rng, planner, is_noisy = self._rng(2), self.study.planner, self.noisy is not None and self.noisy.is_noisy
+        rng, planner = self._rng(2), self.study.planner
         with single_threaded():
-            relevant = np.empty((0, 0))
-            if self.noisy is None:
-                pairs = loop_pairs(planner, self.posterior, point[None])
-                if not len(pairs):
-                    return None
-                relevant = pairs[rng.permutation(len(pairs))[:300]]
-            draws = self.drawn_from.draw(relevant, rng)
-            recorded = self.study.extended.recorded
-            return predict_execution(planner, draws, point, len(self.executed), recorded, noisy=is_noisy)
+            pairs = loop_pairs(planner, self.drawn_from, point[None])
+            if self.noisy is None and not len(pairs):
+                return None
+            draws = self.drawn_from.draw(pairs[rng.permutation(len(pairs))[:300]], rng)
+            return predict_execution(planner, draws, point, len(self.executed), self.study.extended.recorded)
 
     def _rng(self, purpose: int) -> np.random.Generator:
         return np.random.default_rng([self.study.seed, len(self.executed), purpose])

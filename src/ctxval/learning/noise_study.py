@@ -14,12 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, Rows, single_threaded
+from ctxval._util.arrays import Array, Mask, single_threaded
 from ctxval._util.latest import Latest
 from ctxval.core.model import Model
 from ctxval.errors import InputError
-from ctxval.learning.closed_loops import LoopPlanner, Together
-from ctxval.learning.draws import DisturbedDynamics
+from ctxval.learning.closed_loops import AnyPosterior, LoopPlanner
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import History, Record, Structure
@@ -111,43 +110,32 @@ class NoiseStudy:
         horizon, seed = max(len(record.inputs) for record in records), (self.seed, len(records))
         return NoisyPosterior(fit, data, _scatter_of(records), horizon, replicates, self.quantile, seed), chosen
 
-    def _effect(self, posterior: DynamicsPosterior | NoisyPosterior, starts: Array | None = None) -> float:
+    def _effect(self, posterior: AnyPosterior, starts: Array | None = None) -> float:
         """Return the largest standard deviation of a task's distance over noise, as a share of the largest distance.
 
         If they are given, it is that over starts with such deviations ``(n,)``. The tasks have large finite distances.
         """
-        causes, planner = [posterior.deviations] if starts is None else [starts], self.planner
-        if starts is None and isinstance(posterior, NoisyPosterior):
-            causes.append(posterior.scatter)
-        rounding = _ROUNDING * posterior.data.scale[: len(posterior.data.sizes)]
-        if not any((each > rounding).any() for each in causes):
+        planner, rounding = self.planner, _ROUNDING * posterior.data.scale[: len(posterior.data.sizes)]
+        noisy = posterior.with_noise(_RUNS, rounding) if starts is None else None
+        if noisy is None and (starts is None or not (starts > rounding).any()):
             return 0.0
-
-        def noise(ways: Rows, x: Array) -> Array:
-            # The noise is a function of the states, so that a loop is the same each time.
-            seed = np.frombuffer(np.ascontiguousarray(x).tobytes()[-64:], dtype=np.uint32)
-            rng = np.random.default_rng([int(ways[0]), *seed.tolist()])
-            return posterior.deviations * rng.standard_normal(x.shape)
-
+        silent = posterior.mean.without_noise()
         with single_threaded(), np.errstate(all="ignore"):
             tasks = self.search.pool[:_TRIED]
-            distances = planner.distances(posterior.silent, planner.plan(tasks), len(tasks))[0]
+            distances = planner.distances(silent, planner.plan(tasks), len(tasks))[0]
             distances = np.nan_to_num(distances, nan=-1.0, posinf=-1.0)
             planned = planner.plan(tasks[np.argsort(-distances, kind="stable")[:_TASKS]])
             runs = np.full((_RUNS, min(_TASKS, len(tasks))), np.nan)
-            if starts is None:
-                noisy: Together = posterior.mean
-                if isinstance(posterior, DynamicsPosterior):  # white noise as large as was learned, several times
-                    noisy = DisturbedDynamics(posterior.mean, np.arange(_RUNS), noise)
+            if noisy is not None:
                 for plan, loops in zip(planned, planner.run(noisy, planned), strict=True):
                     runs[: len(loops.distances), plan.rows] = loops.distances[:_RUNS]
-            else:
+            elif starts is not None:
                 rng = np.random.default_rng(0)
                 for run in runs:
                     initial = [plan.task.initial_state for plan in planned]
                     moved = zip(planned, [x + starts * rng.standard_normal(x.shape) for x in initial], strict=True)
                     tried = [replace(plan, task=plan.task.starting_at(x)) for plan, x in moved]
-                    run[:] = planner.distances(posterior.silent, tried, len(run))[0]
+                    run[:] = planner.distances(silent, tried, len(run))[0]
         runs = runs[:, np.isfinite(runs).any(axis=0)]
         if not runs.size or not distances.max() > 0:
             return 0.0

@@ -9,11 +9,14 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Rows
 from ctxval._util.representation import ShortRepr
+from ctxval.core.model import Step
+from ctxval.learning.draws import Draws
 from ctxval.learning.features import Features, LinearFunction
 from ctxval.learning.innovations import DrawnWeights, InnovationsFit
 from ctxval.learning.residual_data import ResidualData
@@ -25,7 +28,7 @@ SETTLED = 80  # sequences of noise at the tasks that a search has found
 
 
 @dataclass(frozen=True, eq=False)
-class NoisyDraws(ShortRepr):
+class NoisyDraws(Draws):
     """S residuals with R sequences of noise each, which are the same in every task (common random numbers)."""
 
     fit: InnovationsFit
@@ -39,7 +42,7 @@ class NoisyDraws(ShortRepr):
     def of(
         cls, fit: InnovationsFit, groups: Sequence[DrawnWeights], scatter: Array, horizon: int, replicates: int,
         quantile: float, rng: np.random.Generator,
-    ) -> NoisyDraws:  # fmt: skip
+    ) -> Self:  # fmt: skip
         """Return draws with fresh noise; the first records scatter with standard deviations ``(n,)``."""
         shape = (sum(len(weights) for _, weights, _ in groups), replicates)
         rows = rng.integers(len(fit.innovations), size=(*shape, horizon))
@@ -49,23 +52,29 @@ class NoisyDraws(ShortRepr):
         return len(self.rows)
 
     @property
-    def replicates(self) -> int:
+    def replicates(self) -> int:  # type: ignore[override]
         """The number R of sequences of noise."""
         return int(self.rows.shape[1])
 
-    def with_replicates(self, count: int, rng: np.random.Generator) -> NoisyDraws:
-        """Return the same residuals with other sequences of noise."""
+    @functools.cached_property
+    def searched(self) -> Self:
+        """The same with fewer sequences of noise, with which a search finds the same tasks."""
+        few = self.replicates > ROUGH
+        return replace(self, rows=self.rows[:, :ROUGH], start=self.start[:, :ROUGH]) if few else self
+
+    def settled(self, rng: np.random.Generator) -> Self:
+        """Return the same residuals with many other sequences of noise."""
         if self.replicates == 1:
             return self  # there is hardly any noise
         scatter = np.sqrt((self.start**2).mean(axis=(0, 1)))
-        return NoisyDraws.of(self.fit, self.groups, scatter, self.rows.shape[2], count, self.quantile, rng)
+        return self.of(self.fit, self.groups, scatter, self.rows.shape[2], SETTLED, self.quantile, rng)
 
-    def without_noise(self) -> NoisyDraws:
+    def without_noise(self) -> Self:
         """Return the same residuals without noise."""
         groups = tuple((features, weights, np.zeros_like(noise)) for features, weights, noise in self.groups)
         return replace(self, groups=groups, rows=self.rows[:, :1], start=np.zeros_like(self.start[:, :1]))
 
-    def __getitem__(self, rows: ArrayLike) -> NoisyDraws:
+    def __getitem__(self, rows: ArrayLike) -> Self:
         """Return some draws; their rows are in ascending order."""
         chosen = np.atleast_1d(np.asarray(rows, dtype=np.intp))
         groups, first = [], 0
@@ -75,6 +84,11 @@ class NoisyDraws(ShortRepr):
             if len(some):
                 groups.append((features, weights[some], noise[some]))
         return replace(self, groups=tuple(groups), rows=self.rows[chosen], start=self.start[chosen])
+
+    def begun(self, rows: Rows, tasks: int, start: Array) -> tuple[Array, Step]:
+        """Return the first states, and a step that is called once for each step of the loops."""
+        runs = NoisyRuns(self, *np.divmod(rows // tasks, self.replicates), start)
+        return runs.first, runs.step
 
     def reduced(self, distances: Array) -> Array:
         """Return the quantile over the noise of distances ``(S R, q)``, shape ``(S, q)``."""
@@ -144,6 +158,8 @@ class NoisyPosterior(ShortRepr):
     quantile: float
     seed: tuple[int, ...]
 
+    has_pivots: ClassVar[bool] = False  # draws are not those of a DynamicsPosterior
+
     def functions_for(self, draws: int) -> int:
         """Return the number of weights for each draw of the hyperparameters that gives at least so many draws."""
         return max(_FUNCTIONS, -(-draws // _GROUPS))
@@ -152,11 +168,6 @@ class NoisyPosterior(ShortRepr):
     def noise(self) -> float:
         """The variance of noise as a share of the mean square of a state's error of M, where it is largest."""
         return self.fit.share
-
-    @property
-    def deviations(self) -> Array:
-        """The learned standard deviations of the noise of each state in a step, shape ``(n,)``."""
-        return self.fit.noise
 
     @property
     def is_noisy(self) -> bool:
@@ -169,21 +180,14 @@ class NoisyPosterior(ShortRepr):
         most = [(self.fit.features, self.fit.weights[None], self.fit.noise[None])]
         return self._with_noise(most, np.random.default_rng([*self.seed, 1]))
 
-    @functools.cached_property
-    def searched(self) -> NoisyDraws:
-        """The same with fewer sequences of noise, with which a search finds the same tasks."""
-        few = replace(self.mean, rows=self.mean.rows[:, :ROUGH], start=self.mean.start[:, :ROUGH])
-        return self.mean if self.mean.replicates <= ROUGH else few
-
     @property
     def rough_mean(self) -> NoisyDraws:
         """What is searched; nothing is cheaper and as good."""
-        return self.searched
+        return self.mean.searched
 
-    @functools.cached_property
-    def silent(self) -> NoisyDraws:
-        """The most probable residual without noise."""
-        return self.mean.without_noise() if self.is_noisy else self.mean
+    def with_noise(self, runs: int, least: Array) -> NoisyDraws | None:
+        """Return the mean; None if all deviations are at most those that are given, ``(n,)``."""
+        return self.mean if ((self.fit.noise > least) | (self.scatter > least)).any() else None
 
     def draw(
         self,

@@ -19,11 +19,9 @@ from ctxval._util.arrays import Array, Mask, single_threaded
 from ctxval._util.boxes import latin_hypercube, moves_to_bounds, separated_rows
 from ctxval.gp.ascent import ascend
 from ctxval.gp.global_search import search_globally
-from ctxval.learning.closed_loops import AnyDraws, LoopPlanner, PlannedTasks, loop_pairs
-from ctxval.learning.dynamics_posterior import DynamicsPosterior
-from ctxval.learning.noisy_draws import SETTLED, NoisyDraws, NoisyPosterior
+from ctxval.learning.closed_loops import AnyPosterior, LoopPlanner, PlannedTasks, loop_pairs
+from ctxval.learning.draws import Draws
 
-AnyPosterior = DynamicsPosterior | NoisyPosterior  # of dynamics without and with noise
 _DIVERGED = 1e30  # the distance of a loop that diverges, in searches: larger than all others, and finite
 _EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)  # tasks of a global search, for 1, 2, ... parameters
 _SHOWN = 16  # largest number of these tasks
@@ -179,13 +177,13 @@ class WorstCaseSearch:
             order = [row for row in np.argsort(-values, kind="stable") if left[row]] or [int(values.argmax())]
             elites = self.members[order[: self.settings.elites]]
             return self._of_mean(posterior, float(values[order[0]]), elites, len(values))
-        settings, distance = self.settings, self._on_one(posterior.searched)
+        settings, distance = self.settings, self._on_one(posterior.mean.searched)
         best = self.pool[np.argsort(-_finite(of_pool), kind="stable")[: settings.elites * 4]]
         starts = np.concatenate([known, best])
         with single_threaded():
             if not globally and not is_kinked(self.planner.validation.distance):
                 budget = min(_SCREENED[1], settings.evaluations)
-                same = posterior.rough_mean is posterior.searched
+                same = posterior.rough_mean is posterior.mean.searched
                 rough = None if same else self._on_one(posterior.rough_mean)
                 box = np.zeros(self.dimension), np.ones(self.dimension)
                 points, values = ascend(distance, box, budget, starts[: len(known) + _SHOWN], rng, rough)
@@ -197,7 +195,7 @@ class WorstCaseSearch:
         return self._of_mean(posterior, float(maximum.values[0]), elites, len(maximum.values))
 
     def _of_mean(self, posterior: AnyPosterior, highest: float, elites: Array, evaluations: int) -> WorstCase:
-        if posterior.searched is not posterior.mean:
+        if posterior.mean.searched is not posterior.mean:
             with single_threaded():
                 values = self._distances(posterior.mean, elites)[0]
             order = np.argsort(-values, kind="stable")
@@ -224,9 +222,9 @@ class WorstCaseSearch:
             tasks = self._shared_tasks(of_mean, known, self.settings.shared, rng)
             draws = posterior.draw(self.relevant(posterior, tasks, rng), rng, functions)
             points, maxima, loops = self._search_draws(draws, tasks, rng)
-            if isinstance(draws, NoisyDraws):
+            settled = draws.settled(rng)
+            if settled is not None:
                 # The search has chosen tasks with few sequences of noise, which its own maxima exaggerate.
-                settled = draws.with_replicates(SETTLED, rng)
                 maxima = _finite(self.planner.own_distances(settled, points[:, None]))[:, 0]
             # The largest share that the distance of an elite loses at the median of the tasks next to it. If
             # controllers jump from task to task, the largest distance is a needle that a search finds by chance. Kinks
@@ -255,20 +253,18 @@ class WorstCaseSearch:
         assert self.members is not None
         return np.asarray(~(self.members[:, None] == known).all(axis=2).any(axis=1))
 
-    def _distances(self, draws: AnyDraws, points: Array) -> Array:
+    def _distances(self, draws: Draws, points: Array) -> Array:
         return _finite(self.planner.distances(draws, self.planner.plan(points), len(points)))
 
-    def _on_one(self, mean: AnyDraws) -> Callable[[Array], Array]:
+    def _on_one(self, mean: Draws) -> Callable[[Array], Array]:
         return lambda points: np.asarray(self._distances(mean, points)[0])
 
     def relevant(self, posterior: AnyPosterior, tasks: Array, rng: np.random.Generator) -> Array:
         """Return standardised pairs on the mean's closed loops, from which pivots are chosen; noisy draws have none."""
-        if isinstance(posterior, NoisyPosterior):
-            return np.empty((0, 0))
         pairs = loop_pairs(self.planner, posterior, tasks)
         return pairs[rng.permutation(len(pairs))[: self.settings.relevant]]
 
-    def _search_draws(self, draws: AnyDraws, tasks: Array, rng: np.random.Generator) -> tuple[Array, Array, int]:
+    def _search_draws(self, draws: Draws, tasks: Array, rng: np.random.Generator) -> tuple[Array, Array, int]:
         """Return the best points ``(S, d)`` of draws and their distances, and the number of all loops."""
         values, loops = self._on_shared(draws, tasks)
         order = np.argsort(-values, axis=1, kind="stable")
@@ -313,7 +309,7 @@ class WorstCaseSearch:
             searched = np.flatnonzero(best + 3 * (best - before).max() >= np.median(best))
         return points, best, loops
 
-    def _on_shared(self, draws: AnyDraws, tasks: Array) -> tuple[Array, int]:
+    def _on_shared(self, draws: Draws, tasks: Array) -> tuple[Array, int]:
         """Return the distances ``(S, q)`` of draws on tasks that they share, and the number of loops.
 
         After some draws, tasks that are far below the worst one of a draw, compared with how much draws differ there,
