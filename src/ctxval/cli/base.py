@@ -33,6 +33,7 @@ from ctxval.certificates.bounds import as_text
 from ctxval.cli.commands import TEXTS, Screen, app, line
 from ctxval.core.experiment import UnitsWarning
 from ctxval.core.plan import DistanceWarning
+from ctxval.core.trial import Trials
 from ctxval.core.validation import CostWarning
 from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
 
