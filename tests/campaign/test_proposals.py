@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import make_validation
-from ctxval import Campaign, Task, Trajectory, Validation, searches
+from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, distances, searches, systems
 from ctxval.campaign.costs import costs_of
 from ctxval.core.controller import Controller
 from ctxval.systems import Manual
@@ -116,3 +116,25 @@ def test_a_number_of_designs_makes_the_same_choices_each_time() -> None:
     campaigns = [Campaign(make_validation(), search=searches.Auto(60), seed=4).run(3, explore=True) for _ in range(2)]
     points = [[trial.unit_point for trial in campaign.trials] for campaign in campaigns]
     np.testing.assert_array_equal(*points)
+
+
+class Constant:
+    def design(self, task: Task, model: object) -> Controller:
+        return lambda t, x: np.asarray(task.goal)
+
+
+def test_a_model_may_refuse_states_that_its_closed_loops_do_not_visit() -> None:
+    def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        if np.abs(x).max() > 1.2:
+            raise ValueError("out of table")
+        return np.array([0.9 * x[0] + 0.1 * u[0]])
+
+    validation = Validation(
+        space=TaskSpace(goal=(-1.0, 1.0)),
+        task=lambda p: Task(initial_state=[0.0], goal=[p.goal], horizon=8, dt=0.1),
+        system=systems.Simulated(lambda x, u: 0.85 * x + 0.1 * u),
+        model=step,
+        synthesizer=Constant(),
+        distance=distances.FinalState(),
+    )
+    assert Campaign(validation).run(2).executions == 2

@@ -53,6 +53,17 @@ def test_without_noise_one_execution_falsifies() -> None:
     assert bets_against([trial(0, 1.2)], 1.0) is None
 
 
+def test_noise_that_is_no_longer_predicted_explains_no_excess_that_repeats_to_the_last_digit() -> None:
+    unlikely = np.linspace(0.1, 0.9, 200)
+    silent: dict[str, Any] = {"prediction": {"noise": None, "quantiles": [0.5]}}
+    early, excess = trial(0, 0.5, unlikely), replace(trial(1, 1.2), note=silent)
+    again = replace(excess, number=2)
+    assert counterexample([early, excess], 1.0) is None
+    assert counterexample([early, excess, again], 1.0) is not None
+    assert counterexample([early, excess, replace(again, distance=1.1)], 1.0) is None
+    assert counterexample([early, excess, again, trial(3, 0.5, unlikely)], 1.0) is None
+
+
 def test_an_undecided_verdict_says_that_noise_may_explain_an_excess() -> None:
     likely = np.linspace(0.5, 1.3, 200)
     reason = judge([trial(0, 0.9, likely), trial(1, 1.1, likely)], 1.0).reason

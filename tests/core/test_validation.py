@@ -404,6 +404,18 @@ def test_accepting_refuses_what_is_no_execution_of_the_plan() -> None:
     assert validation.accept(plan, moved, start_tolerance=10.0) > 0
 
 
+def test_noise_of_a_task_that_hardly_moves_is_no_other_start() -> None:
+    validation = make()
+    plan = validation.plan(POINT)
+    whole = validation.system.execute(plan.controller, plan.task)
+    noise = 0.3 * np.random.default_rng(0).standard_normal(whole.states.shape)
+    noise[0] = 0.3
+    assert validation.accept(plan, Trajectory(whole.times, whole.states + noise, whole.inputs)) > 0
+    far = Trajectory(whole.times, whole.states + noise + 2.0, whole.inputs)
+    with pytest.raises(InputError, match="starts elsewhere"):
+        validation.accept(plan, far)
+
+
 @pytest.mark.parametrize("distance", [lambda a, b, task: np.nan, lambda a, b, task: 1 / 0, lambda a, b, task: -1.0])
 def test_an_accepted_execution_without_a_usable_distance_says_why(distance: object) -> None:
     validation = make(distance=distance)

@@ -36,6 +36,16 @@ def idle(t: int, x: Array) -> Array:
     return np.zeros(1)
 
 
+def test_an_object_that_is_no_environment_is_refused() -> None:
+    class Robot:
+        def reset(self) -> None: ...
+
+        def step(self, u: Array) -> None: ...
+
+    with pytest.raises(InputError, match="which has no action_space"):
+        Gymnasium(Robot())
+
+
 def test_reacher_moves_as_its_mujoco_model_does() -> None:
     states = Gymnasium("Reacher-v5").execute(damp, REACHER).states
     environment = gymnasium.make("Reacher-v5").unwrapped

@@ -40,10 +40,19 @@ class Bets:
 
 
 def bets_against(trials: Sequence[Trial], threshold: float, quantile: float = QUANTILE) -> Bets | None:
-    """Return the bets of trials against a threshold; None if no execution was predicted to be noisy."""
-    if not any(_prediction(trial).get("noise") for trial in trials):
+    """Return the bets of trials against a threshold; None if the system is not noisy.
+
+    It is not if no execution was predicted to be, or if the last one was not, and an excess repeated to the last digit.
+    """
+    known = [trial for trial in trials if trial.distance is not None]
+    noises = [prediction.get("noise") for trial in trials if (prediction := _prediction(trial))]
+    if not any(noises):
         return None
-    whole, repetitions, above, known = 1.0, 1.0, 0, [trial for trial in trials if trial.distance is not None]
+    if not noises[-1]:
+        excesses = (executions_of(trial, known) for trial in known if (trial.distance or 0.0) > threshold)
+        if any(len(alike) > 1 and len({each.distance for each in alike}) == 1 for alike in excesses):
+            return None
+    whole, repetitions, above = 1.0, 1.0, 0
     for k, trial in enumerate(known):
         before = executions_of(trial, known[:k])
         repeated = any((earlier.distance or 0.0) > threshold for earlier in before)

@@ -53,7 +53,7 @@ class Validation:
         distance: the distance d between the trajectories of M and S.
         start_tolerance: the largest permitted difference between the first state of an execution and the initial state
             of its task, as a fraction of the range of each state in the trajectory of the model, or of its initial
-            value if that is larger.
+            value if that is larger. Four standard deviations of the noise that the record shows are permitted, too.
         labels: the names and units of states, inputs and distance for files, pictures and reports.
         longest: the largest horizon that is planned.
         physical: names of the task parameters that change the dynamics of S, such as a payload or a surface. What M

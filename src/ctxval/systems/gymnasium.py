@@ -74,6 +74,8 @@ class Gymnasium:
         first = self._made()
         if hasattr(first, "num_envs"):
             raise InputError(f"the environment must be a single one, got {first}; give the one that it repeats.")
+        if missing := [name for name in ("reset", "step", "action_space") if not hasattr(first, name)]:
+            raise InputError(f"the environment must be one of gymnasium, got {first}, which has no {missing[0]}.")
         self._idle = [first]  # each execution takes its own, so that threads do not share one
         space = first.action_space
         if not np.issubdtype(space.dtype or object, np.floating) or not space.shape:

@@ -220,6 +220,10 @@ def test_the_file_says_the_largest_horizon_that_is_planned(invoke: Any, target: 
         assert "longest" in sentence(invoke("run", "e.toml"))
     Path("e.toml").write_text(f"longest = 3\n{text}")
     assert "at most 3 steps are permitted: longest =" in sentence(invoke("run", "e.toml"))
+    Path("e.toml").write_text(f"start_tolerance = 0.5\n{text}")
+    assert read_settings("e.toml", {}).load().validation.start_tolerance == 0.5
+    Path("e.toml").write_text(f"start_tolerance = -1\n{text}")
+    assert "start_tolerance" in sentence(invoke("run", "e.toml"))
 
 
 @pytest.mark.slow

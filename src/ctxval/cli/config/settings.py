@@ -131,6 +131,7 @@ class ExperimentSettings(BaseModel, extra="forbid"):
     budget: int | None = Field(default=None, ge=1)
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
     longest: int | None = Field(default=None, ge=1, strict=True)
+    start_tolerance: float | None = Field(default=None, ge=0, allow_inf_nan=False)
     physical: list[str] | None = None  #: the task parameters that change the dynamics, also of a named experiment
     outputs: str | list[int] | None = None  #: the indices of M's states that are recorded, or a function of them
     explore: bool | None = None  #: as the options of ``ctxval run``, so that a store knows the command that made it
@@ -161,7 +162,7 @@ class ExperimentSettings(BaseModel, extra="forbid"):
                 raise InputError(f"[options] must not contain the seed: {where}.")
             experiment = parts.named_experiment(self.experiment, self.seed, self.options, self.folder)
         validation = experiment.validation
-        stated: dict[str, Any] = {"longest": self.longest, "physical": self.physical}
+        stated = {name: getattr(self, name) for name in ("longest", "physical", "start_tolerance")}
         changed = {name: value for name, value in stated.items() if value is not None}
         if self.refined is not None:  # a model that was learned from executions of the given one
             path = (self.folder or Path()) / self.refined
