@@ -123,7 +123,7 @@ class Constant:
         return lambda t, x: np.asarray(task.goal)
 
 
-def test_a_model_may_refuse_states_that_its_closed_loops_do_not_visit() -> None:
+def test_a_model_may_refuse_states_that_its_closed_loops_do_not_visit(tmp_path: Path) -> None:
     def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         if np.abs(x).max() > 1.2:
             raise ValueError("out of table")
@@ -137,4 +137,4 @@ def test_a_model_may_refuse_states_that_its_closed_loops_do_not_visit() -> None:
         synthesizer=Constant(),
         distance=distances.FinalState(),
     )
-    assert Campaign(validation).run(2).executions == 2
+    assert Campaign(validation, store=tmp_path / "a.sqlite").run(2).executions == 2
