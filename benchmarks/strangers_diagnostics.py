@@ -27,7 +27,7 @@ NAMES = {
     "were predicted from earlier ones": "fewest predictions",
     "noise is learned": "noise",
     "contradict the learned noise": "evidence against the noise",
-    "leave out": "variance left out",
+    "understate the predictive uncertainty": "variance left out",
     "leave the recorded range": "beyond the records",
     "enter a gap in the records": "gap",
     "enter a gap in the joint records": "joint gap",

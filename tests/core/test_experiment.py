@@ -42,6 +42,17 @@ def test_comparable_states_give_no_warning(distance: Any) -> None:
         Experiment("x", make_validation(distance=distance), states=LABELS)
 
 
+def test_a_distance_in_another_unit_than_its_states_is_warned_of() -> None:
+    distance = distances.FinalState(components=[0])
+    with pytest.warns(UnitsWarning, match="the distance is in rad, as its states are, and not in deg: no unit is"):
+        Experiment("x", make_validation(distance=distance), states=LABELS, units="deg")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Experiment("x", make_validation(distance=distance), states=LABELS, units="rad")
+        scaled = distances.FinalState(components=[0], scales=[0.1])
+        Experiment("x", make_validation(distance=scaled), states=LABELS, units="1")
+
+
 @pytest.mark.parametrize("labels", [(), ("angle", "rate"), ("a [rad]", "b [rad]"), ("a [rad]", "b")])
 def test_without_different_units_there_is_no_warning(labels: tuple[str, ...]) -> None:
     with warnings.catch_warnings():

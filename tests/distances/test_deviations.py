@@ -375,19 +375,19 @@ def test_a_description_names_only_what_changes_the_distance() -> None:
 
 
 @pytest.mark.parametrize(
-    ("distance", "mixed"),
+    ("distance", "added"),
     [
         (FinalState(), ("m", "rad")),
         (MaximumDeviation(np.inf), ("m", "rad")),
-        (FinalState(components=(0, 2)), ()),
+        (FinalState(components=(0, 2)), ("m",)),
         (FinalState(components=(0, -2)), ("m", "rad")),
         (FinalState(weights=[1, 1, 1]), ()),
         (FinalState(scales=[1, 1, 1]), ()),
         (RelativeDeviation(least=[1, 1, 1]), ()),
     ],
 )
-def test_a_distance_knows_which_units_it_mixes(distance: StateNorm, mixed: tuple[str, ...]) -> None:
-    assert distance.mixed_units(["m", "rad", ""]) == mixed
+def test_a_distance_knows_which_units_it_adds(distance: StateNorm, added: tuple[str, ...]) -> None:
+    assert distance.added_units(["m", "rad", ""]) == added
 
 
 def test_a_tracking_error_is_that_between_s_and_its_reference() -> None:

@@ -15,7 +15,7 @@ from ctxval.core.validation import Validation
 
 
 class UnitsWarning(UserWarning):
-    """A distance adds states of different units without weights or scales."""
+    """A distance without weights or scales adds states of different units, or of another unit than its own."""
 
 
 @checked
@@ -23,7 +23,8 @@ class UnitsWarning(UserWarning):
 class Experiment:
     """A validation with its defaults, as ``ctxval run`` runs it; it gets the names and units as its labels.
 
-    A UnitsWarning says that the distance adds states of different units, and has neither weights nor scales.
+    A UnitsWarning says that the distance, without weights and scales, adds states of different units, or of another
+    unit than its own.
     """
 
     name: str  #: a short name for files and displays
@@ -43,18 +44,30 @@ class Experiment:
             object.__setattr__(self, name, getattr(labels, name))
         if labels != given:
             object.__setattr__(self, "validation", self.validation.with_parts(labels=labels))
-        if self.mixed_units:
-            warnings.warn(mixed_units_sentence(self.mixed_units), UnitsWarning, stacklevel=3)
+        if (doubt := self.doubt_of_units) is not None:
+            warnings.warn(doubt, UnitsWarning, stacklevel=3)
 
     @property
-    def mixed_units(self) -> tuple[str, ...]:
-        """The units that the distance adds although they differ; none if it has weights or scales, or if none is known.
+    def doubt_of_units(self) -> str | None:
+        """Why the number that the distance gives is in no unit, or in another one than stated; None if all is well.
 
-        A distance states them by its method ``mixed_units(units) -> units``, as the ready-made ones do.
+        A distance states which units it adds by its method ``added_units(units) -> units``, as the ready-made ones do.
         """
-        ask = getattr(self.validation.distance, "mixed_units", None)
+        ask = getattr(self.validation.distance, "added_units", None)
         units = [parted(label)[1] for label in self.states] or [*names_of(self.validation.system, "states").values()]
-        return tuple(ask(units)) if callable(ask) and units else ()
+        added = tuple(ask(units)) if callable(ask) and units else ()
+        if len(added) > 1:
+            return (
+                f"the distance adds states in {' and '.join(added)} without weights or scales, so it depends on the "
+                "choice of units: give scales=[...], the size of an error of each state that counts as 1, or "
+                "weights=[1, ...] if the plain sum is meant."
+            )
+        if added and self.units and added[0] != self.units:
+            return (
+                f"the distance is in {added[0]}, as its states are, and not in {self.units}: no unit is converted, so "
+                f"state units={added[0]!r} and a threshold in {added[0]}, or give scales."
+            )
+        return None
 
     def names(self, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:
         """Return the names of n states and m inputs with their units (:meth:`Labels.names`)."""
@@ -64,12 +77,3 @@ class Experiment:
         known = {"threshold": self.threshold, "units": self.units or None, "truth": self.truth}
         head = call(self, self.name, self.validation.space, budget=self.budget, **known)
         return lines(head, *(part.strip() for part in repr(self.validation).splitlines()[1:]))
-
-
-def mixed_units_sentence(units: tuple[str, ...]) -> str:
-    """Return the sentence that a distance adds these units."""
-    return (
-        f"the distance adds states in {' and '.join(units)} without weights or scales, so it depends on the choice of "
-        "units: give scales=[...], the size of an error of each state that counts as 1, or weights=[1, ...] if the "
-        "plain sum is meant."
-    )

@@ -73,14 +73,13 @@ class StateNorm(NamedStates):
         moved[..., angles] = turned(gap[..., angles])
         return moved
 
-    def mixed_units(self, units: Sequence[str]) -> tuple[str, ...]:
-        """Return the units of states that the norm adds although they differ; none if it has weights or scales."""
+    def added_units(self, units: Sequence[str]) -> tuple[str, ...]:
+        """Return the units of the states that the norm adds; none if it has weights or scales."""
         if self.weights is not None or self.scales is not None:
             return ()
         compared = range(len(units)) if self.components is None else self.components
         places = [i for i in compared if not isinstance(i, str) and -len(units) <= i < len(units)]
-        distinct = dict.fromkeys(units[i] for i in places if units[i])
-        return tuple(distinct) if len(distinct) > 1 else ()
+        return tuple(dict.fromkeys(units[i] for i in places if units[i]))
 
     def describe(self) -> dict[str, Any]:
         names = [field.name for field in dataclasses.fields(self)]
@@ -224,7 +223,7 @@ class RelativeDeviation(StateNorm):
         super().__post_init__()
         require_numbers("least", self.least, self.components, zero=False)
 
-    def mixed_units(self, units: Sequence[str]) -> tuple[str, ...]:
+    def added_units(self, units: Sequence[str]) -> tuple[str, ...]:
         return ()
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:

@@ -530,9 +530,9 @@ def test_every_distance_is_written_in_a_file_as_in_python(name: str) -> None:
     assert found.distance == make_validation(distance=in_python).outcome([0.5]).distance
     assert np.isfinite(found.distance)
     if "weights" in table and name != "relative":
-        assert made.mixed_units(["rad", "rad/s"]) == ()
+        assert made.added_units(["rad", "rad/s"]) == ()
         del table["weights"], table["scales"]
-        assert getattr(distances, type(made).__name__)(**table).mixed_units(["rad", "rad/s"]) == ("rad", "rad/s")
+        assert getattr(distances, type(made).__name__)(**table).added_units(["rad", "rad/s"]) == ("rad", "rad/s")
 
 
 @pytest.mark.parametrize(

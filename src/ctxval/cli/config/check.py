@@ -16,7 +16,7 @@ from ctxval._util.texts import reason_of
 from ctxval.campaign.costs import ThinkingCosts
 from ctxval.certificates.bounds import of_tasks
 from ctxval.core.controller import converged_of
-from ctxval.core.experiment import Experiment, mixed_units_sentence
+from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of, names_of
 from ctxval.core.plan import Plan, require_repeatable
 from ctxval.core.soundness import MISSED, SATURATED, goal_misses
@@ -201,8 +201,8 @@ def _batches(validation: Validation, plans: Sequence[Plan]) -> Findings:
 
 def _distance(experiment: Experiment, plans: Sequence[Plan]) -> Findings:
     validation, trajectories = experiment.validation, [plan.model_trajectory for plan in plans]
-    if experiment.mixed_units:
-        yield "noted", mixed_units_sentence(experiment.mixed_units).removesuffix(".")
+    if (doubt := experiment.doubt_of_units) is not None:
+        yield "noted", doubt.removesuffix(".")
     states, inputs = (np.stack([getattr(run, name) for run in trajectories]) for name in ("states", "inputs"))
     model, shifted = (Trajectory(trajectories[0].times, states + shift, inputs) for shift in (0.0, 0.01))
     try:
