@@ -47,7 +47,7 @@ def test_results_measured_with_other_sources_are_counted(package: Path) -> None:
     source_digest.cache_clear()
     said = measured_with([old, provenance(), unnamed, {**old, "libraries": "numpy 1.0"}])
     assert said.startswith(
-        "Results measured with the present sources of `gp`, `searches`: 1; before the last change of the source: 2; before "
+        "Results measured with the present sources of `gp`, `searches`: 1; before the last change of the source: 2; "
     )
     assert said.endswith(f"Libraries: {libraries()}; numpy 1.0.")
 
