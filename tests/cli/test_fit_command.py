@@ -50,6 +50,16 @@ def test_a_linear_model_is_learned_and_written_with_its_data(invoke: Invoke) -> 
     assert len(read.data) == 160
 
 
+def test_what_the_file_of_the_model_needs_is_asked_for_before_anything_is_learned(
+    invoke: Invoke, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    result = invoke("logs", "--kind", "linear", "--out", "model.onnx")
+    assert result.exit_code == 2
+    assert "ctxval[fit]" in result.stderr
+    assert not result.stdout
+
+
 def test_what_is_learned_is_printed(invoke: Invoke) -> None:
     result = invoke("logs", "--kind", "linear, gaussian-process", "--steps", "1,5", "--seed", "2")
     assert result.exit_code == 0, result.stderr

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
+from ctxval._util.onnx_network import require_onnx
 from ctxval._util.refusals import reworded
 from ctxval._util.representation import task_text
 from ctxval._util.texts import shortened
@@ -264,6 +265,8 @@ def require_model_file(path: Path | None, inputs: Iterable[object], *, force: bo
     """Check that the file of a model and those beside it can be written, before anything is learned or executed."""
     if path is not None:
         require_suffix(path)
+        if path.suffix == ".onnx":
+            require_onnx()
         beside = {f"FILE{suffix}": path.with_suffix(suffix) for suffix in BESIDE}
         require_outputs({"--out": path, **beside}, inputs, force=force)
 
@@ -279,7 +282,8 @@ def _print_fit(report: FitReport) -> None:
     held, learned = report.held_out, report.learned_from
     errors_on = f"errors on {held.steps} steps of {len(held.runs)} others"
     out.say(f"learned from {learned.steps} steps of {len(learned.runs)} recordings; {errors_on}")
-    print_errors(report.fitted, "error on held-out recordings", list(held.states))
+    if report.fitted:
+        print_errors(report.fitted, "error on held-out recordings", list(held.states))
     for model in report.fitted:
         print_parameters(model.parameters)
         for note in model.notes:
