@@ -12,7 +12,7 @@ from rig_cli import Invoke, calling, report
 
 FILE = """
 name = "wall"
-units = "rad"
+units = "m"
 threshold = 7.0
 budget = 20
 
