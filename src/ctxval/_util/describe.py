@@ -81,8 +81,8 @@ def plain_json(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return values, dataclasses among them, as they are read from JSON; a number that is not finite is None."""
 
     def fields(part: Any) -> Any:
-        own = getattr(part, "to_json", None)
-        return own() if own else {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
+        to_json = getattr(part, "to_json", None)
+        return to_json() if to_json else {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
 
     return dict(json.loads(json.dumps(values, default=fields), parse_constant=lambda _: None))
 

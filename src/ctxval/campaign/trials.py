@@ -114,8 +114,8 @@ class TrialRecorder:
             self.search.remember([trial.note for trial in history])
 
     def _tell_search(self, trials: Sequence[Trial]) -> None:
-        told = Trials(trials)
-        self.search.tell(told.points(self.validation.space.dimension), told.distances.tolist())
+        known = Trials(trials)
+        self.search.tell(known.points(self.validation.space.dimension), known.distances.tolist())
 
     def refresh(self) -> None:
         """Read the trials again if other processes have changed the store."""

@@ -244,21 +244,21 @@ class DynamicsStudy(ShortRepr):
 
     def _found_actuator(self, executed: Executed, learned: LearnedDynamics) -> Actuator | None:
         """Return a delay and a lag of inputs that explain the errors of predictions; one that is found is refined."""
-        found = None
+        actuator = None
         counts = range(_FEWEST_AGAINST, len(executed) + 1) if self.actuator is None else ()
         for some in (executed[:count] for count in counts if scheduled(count) == count):
             key = digest(trajectory for _, trajectory in some)
             if key not in self._actuators:
                 self._actuators[key] = None  # also if its search fails
                 known: LearnedDynamics | None = learned
-                if found is None and len(some) < len(executed):
+                if actuator is None and len(some) < len(executed):
                     extended = self.extended.executions(some)
                     known = None if extended is None else self._learn(extended, (), with_data=True)
                 # Left-out error below which nobody asks whether inputs act late.
-                if found is not None or (known is not None and known.left_out_error > 0.02):
-                    self._actuators[key] = self._search_actuator(some, found)
-            found = self._actuators[key]
-        return found
+                if actuator is not None or (known is not None and known.left_out_error > 0.02):
+                    self._actuators[key] = self._search_actuator(some, actuator)
+            actuator = self._actuators[key]
+        return actuator
 
     def _search_actuator(self, executed: Executed, before: Actuator | None) -> Actuator | None:
         estimated = self.given.outputs is not None
