@@ -38,7 +38,7 @@ from ctxval.certificates.sample import without_success
 from ctxval.core.distance import Distance
 from ctxval.core.plan import StartOffset, input_difference, start_offset
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import Trial
+from ctxval.core.trial import Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError, CtxvalError, InputError
 from ctxval.gp.surrogate import Surrogate, fit_surrogate
@@ -116,34 +116,34 @@ class Campaign:
         return self.recorder.store
 
     @property
-    def trials(self) -> tuple[Trial, ...]:
-        """All trials in the order of asking."""
+    def trials(self) -> Trials:
+        """All trials in the order of asking, a tuple."""
         return self.recorder.trials
 
     @property
     def completed(self) -> list[Trial]:
         """The trials with a distance."""
-        return list(self.recorder.trials.completed)
+        return list(self.trials.completed)
 
     @property
     def failed(self) -> list[Trial]:
         """The trials that failed."""
-        return list(self.recorder.trials.in_state("failed"))
+        return list(self.trials.in_state("failed"))
 
     @property
     def unmeasured(self) -> list[Trial]:
         """The trials that were executed but have no distance, because it could not be measured."""
-        return list(self.recorder.trials.in_state("unmeasured"))
+        return list(self.trials.in_state("unmeasured"))
 
     @property
     def executions(self) -> int:
         """The number of executions of S that have ended, with or without success."""
-        return self.recorder.trials.executions
+        return self.trials.executions
 
     @property
     def worst(self) -> Trial | None:
         """The completed trial with the largest distance."""
-        return self.recorder.trials.worst
+        return self.trials.worst
 
     def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
         """Return the trajectories of the model and of the system in a trial; None if a trajectory is not stored.
@@ -312,7 +312,7 @@ class Campaign:
         pool = worker_pool(self.validation.system, workers=workers, executor=executor, timeout=timeout)
         self.refresh()
         # Interrupted trials are executed again; these are open, because people are executing them.
-        waiting = [str(trial.number) for trial in self.recorder.trials.open if not trial.attempts]
+        waiting = [str(trial.number) for trial in self.trials.open if not trial.attempts]
         if waiting:
             raise CertificateError(
                 f"trials are open: {', '.join(waiting)}. Record their results with `ctxval tell` (tell in Python) "
@@ -385,7 +385,7 @@ class Campaign:
             search = IntervalSearch(self.recorder, options, budget, threshold)
             self.state_threshold(threshold)
             with self.recorder.predicting(search.predicts):
-                choice = search.choose() if self.executions + len(self.recorder.trials.open) < budget else None
+                choice = search.choose() if self.executions + len(self.trials.open) < budget else None
                 return None if choice is None else self.recorder.open(choice)
 
     def reopen(self, number: int, *, ended: bool = False) -> OpenTrial:
@@ -640,12 +640,12 @@ class Campaign:
 
     def _distances(self) -> tuple[Array, Array]:
         """Return the points of the unit cube with a distance ``(n, d)``, and the distances ``(n,)``."""
-        completed = self.recorder.trials.completed
+        completed = self.trials.completed
         return completed.points(self.validation.space.dimension), completed.distances
 
     def __repr__(self) -> str:
         head = call(self, self.validation.space, name=self.name or None, seed=self.seed)
-        return display.as_text(head, self.search, self.recorder)
+        return display.as_text(head, self.recorder)
 
     def _repr_html_(self) -> str:
-        return display.as_html(self.name, self.seed, self.search, self.recorder)
+        return display.as_html(self.name, self.seed, self.recorder)

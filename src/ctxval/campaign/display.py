@@ -12,7 +12,6 @@ from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TASK, TaskSuite
 from ctxval.core.trial import Trial, Trials
 from ctxval.errors import InputError
-from ctxval.searches import Search
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 _BEFORE, _AFTER = ("number", "origin", "state"), ("distance", "seconds", "attempts", "failure")
 
 
-def as_text(head: str, search: Search, recorder: TrialRecorder) -> str:
+def as_text(head: str, recorder: TrialRecorder) -> str:
     """Return a campaign in five lines: the task space, the search, the number of trials, the worst task, the store."""
     worst, at = recorder.trials.worst, "no distance is known"
     if worst is not None and worst.distance is not None:
@@ -28,21 +27,21 @@ def as_text(head: str, search: Search, recorder: TrialRecorder) -> str:
         at = f"trial {worst.number} with distance {number(worst.distance)} at {where}"
     return lines(
         head,
-        f"search: {shown(search)}",
+        f"search: {shown(recorder.search)}",
         f"trials: {_counts(recorder.trials)}",
         f"worst: {at}",
         f"store: {shown(recorder.store)}",
     )
 
 
-def as_html(name: str, seed: int, search: Search, recorder: TrialRecorder) -> str:
+def as_html(name: str, seed: int, recorder: TrialRecorder) -> str:
     """Return a campaign as an HTML table, with one row for each parameter of the worst task."""
     worst, units = recorder.trials.worst, recorder.validation.space.units
     parameters = {} if worst is None else worst.parameters
     return table(
         f"Campaign {name}",
         [
-            ("search", shown(search)),
+            ("search", shown(recorder.search)),
             ("seed", seed),
             ("trials", _counts(recorder.trials)),
             ("worst trial", "no distance is known" if worst is None else worst.number),

@@ -155,9 +155,9 @@ class IntervalSearch:
             return None
         learned = self.recorder.dynamics.learned(trials)
         is_noisy = learned is not None and learned.noisy is not None and learned.noisy.is_noisy
-        if learned is None or (bets is None and not is_noisy):
+        worst = trials.worst
+        if learned is None or worst is None or (bets is None and not is_noisy):
             return None  # but a threshold that noise was predicted to exceed is falsified by repetitions alone
-        worst = max((trial for trial in trials if trial.distance is not None), key=lambda trial: trial.distance or 0.0)
         alike = (trial for trial in trials if trial.distance is not None or trial.state == "open")
         # Times that a noisy task is repeated in any case if its distance exceeds the limit.
         if sum(np.abs(trial.unit_point - worst.unit_point).max() <= 1e-9 for trial in alike) <= 2:

@@ -52,11 +52,11 @@ def convergence(campaign: Campaign, *, threshold: Limit = None, bound: Limit = N
 
     _worst(campaign)
     axes = _axes(ax)
-    known, last = campaign.recorder.trials.completed, len(campaign.trials) - 1
+    known, last = campaign.trials.completed, len(campaign.trials) - 1
     so_far = np.maximum.accumulate(known.distances)
     axes.step([*known.numbers, last], [*so_far, so_far[-1]], where="post", color=_BLUE, lw=1.8, label="largest so far")
     _draw_samples(axes, campaign, lambda trial: trial.number)
-    without = campaign.recorder.trials.in_state("failed", "unmeasured").numbers
+    without = campaign.trials.in_state("failed", "unmeasured").numbers
     if without:
         bottom = axes.get_xaxis_transform()
         axes.plot(without, [0.03] * len(without), "x", color=_ORANGE, transform=bottom, label="no distance is known")
@@ -90,7 +90,7 @@ def surrogate_slice(
     axes.plot(x, np.maximum(mean, 0.0), color=_BLUE, linewidth=1.8, label="GP mean")
     if space.dimension == 1:
         _draw_samples(axes, campaign, lambda trial: space.from_unit(trial.unit_point)[axis])
-    at, label = (space.from_unit(worst.unit_point)[axis], campaign.recorder.trials.largest), "worst task executed"
+    at, label = (space.from_unit(worst.unit_point)[axis], campaign.trials.largest), "worst task executed"
     axes.plot(*at, "*", color=_ORANGE, markeredgecolor=_BLACK, markersize=14, label=label)
     axes.set_xlabel(space.labels[axis])
     return _finished(axes, campaign, threshold, bound)
@@ -133,7 +133,7 @@ def worst_trajectories(campaign: Campaign) -> Figure:
     reference = validation.task(space.parameters(space.from_unit(worst.unit_point))).reference
     states, inputs = map(labels_of, validation.names(model.states.shape[-1], model.inputs.shape[-1]))
     figure = trajectories(model, system, reference=reference, states=states, inputs=inputs)
-    distance = f"{campaign.recorder.trials.largest:.4g} {validation.labels.units}".rstrip()
+    distance = f"{campaign.trials.largest:.4g} {validation.labels.units}".rstrip()
     figure.suptitle(f"worst task executed: {task_text(worst.parameters)} (distance {distance})", fontsize=10)
     return figure
 

@@ -127,7 +127,8 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
     empty = None if sample.suite is not None else largest_empty_box(sample.points)
     statement = statements.dynamics_statement(upper, error, confidence, evidence.quantile)
     assumptions = statements.dynamics_assumptions(evidence)
-    doubt, plain = doubt or diagnostics.doubt_of(evidence, sample.best, bound), evidence.to_json()
+    doubt = doubt or diagnostics.doubt_of(evidence, sample.best, bound)
+    copied = {name: getattr(evidence, name) for name in _COPIED}
     details = {
         "best": sample.best,
         **({} if sample.suite is None else {"tasks": sample.tasks, "not_executed": sample.not_executed}),
@@ -156,7 +157,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
         "coverage_gap_of_pairs": None if coverage.pair is None else coverage.pair.size,
         "largest_gap_at": coverage.marginal.place,
         "resolution": coverage.resolution,
-        **{name: plain[name] for name in _COPIED},
+        **{name: list(value) if isinstance(value, tuple) else value for name, value in copied.items()},
         "variance_left_out": evidence.left_out,
         "pocket": evidence.pocket and asdict(evidence.pocket),
         "empty_box": None if empty is None else asdict(empty),

@@ -271,11 +271,11 @@ def status_of(verdict: Verdict | None) -> int:
     return FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
 
 
-def summary_of(trials: Sequence[Trial]) -> dict[str, Any]:
+def summary_of(trials: Trials) -> dict[str, Any]:
     """Return what became of the trials in a store."""
-    failures, worst = failures_of(trials), Trials(trials).worst
+    failures, worst = failures_of(trials), trials.worst
     return {
-        "executions": Trials(trials).executions,
+        "executions": trials.executions,
         "failed": sum(len(failure["trials"]) for failure in failures),
         "failures": failures,
         "worst": None if worst is None else {"task": worst.parameters, "distance": worst.distance},

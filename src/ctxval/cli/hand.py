@@ -71,7 +71,7 @@ def ask(
             print_verdict(verdict)
             if verdict.answer == "undecided" and not campaign.recorder.has_tasks:
                 out.say("each task of the suite is executed or open: --set task=NAME opens one of them again.")
-            elif verdict.answer == "undecided" and campaign.executions + len(campaign.recorder.trials.open) >= total:
+            elif verdict.answer == "undecided" and campaign.executions + len(campaign.trials.open) >= total:
                 more = "--budget plans more executions, and --explore opens a trial without a verdict"
                 out.say(f"the budget is spent: {more}.")
             decided = {"verdict": verdict.answer, "reason": verdict.reason, "threshold": limit, "store": str(path)}
@@ -86,7 +86,7 @@ def ask(
     if out_ is None:
         require_folder(folder, by_hand.TRIAL_FILES, TASK_FORMAT, force=force)
     files = by_hand.write_files(folder, experiment, waiting)
-    others = [number for number in campaign.recorder.trials.open.numbers if number != waiting.number]
+    others = [number for number in campaign.trials.open.numbers if number != waiting.number]
     task = ", ".join(f"{name} = {value}" for name, value in waiting.trial.parameters.items())
     out.say(f"trial {waiting.number}: {task}")
     out.say(f"{', '.join(files)} in {folder}")

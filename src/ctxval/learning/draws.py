@@ -21,7 +21,10 @@ from ctxval.learning.residual_data import ResidualData
 class Draws(ShortRepr, ABC):
     """S systems, with R sequences of noise each, whose closed loops are run together."""
 
-    replicates = 1  # the number R, 1 without noise
+    @property
+    def replicates(self) -> int:
+        """The number R of sequences of noise; 1 without noise."""
+        return 1
 
     @abstractmethod
     def __len__(self) -> int: ...

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike
+from ctxval._util.describe import plain_json
 from ctxval._util.representation import ShortRepr
 from ctxval.core.quantiles import LEVELS, chance_of_more
 from ctxval.core.trajectory import Trajectory
@@ -75,8 +75,7 @@ class ExecutionPrediction(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes, ready for JSON: infinity is None."""
-        values: dict[str, Any] = json.loads(json.dumps(asdict(self)), parse_constant=lambda _: None)
-        return values
+        return plain_json(vars(self))
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self | None:

@@ -52,7 +52,7 @@ class NoisyDraws(Draws):
         return len(self.rows)
 
     @property
-    def replicates(self) -> int:  # type: ignore[override]
+    def replicates(self) -> int:
         """The number R of sequences of noise."""
         return int(self.rows.shape[1])
 

@@ -76,14 +76,14 @@ class ServedCampaign:
         """Read the trials in the store, with what people must know of the open tasks before they execute them."""
         self.campaign.refresh()
         validation, tasks = self.campaign.validation, dict[int, dict[str, Any]]()
-        for trial in self.campaign.recorder.trials.open:
+        for trial in self.campaign.trials.open:
             task = validation.task_at(validation.space.parameters(validation.space.point(trial.parameters)))
             start = np.atleast_1d(validation.recorded_task(task).initial_state).tolist()
             labels = labels_of(self.experiment.names(len(start), 0)[0])
             starts = list(zip(labels, start, strict=True))
             tasks[trial.number] = {"start": starts, "horizon": task.horizon, "dt": task.dt}
         # The trials were read after this process's last change, so their counts are those of the signature.
-        return Snapshot(self.campaign.recorder.trials, self.campaign.store.signature()[2], tasks)
+        return Snapshot(self.campaign.trials, self.campaign.store.signature()[2], tasks)
 
 
 OpenCampaign = Callable[[], ServedCampaign]
@@ -154,8 +154,8 @@ def judge(served: ServedCampaign) -> Verdict | None:
         return None
     with stage("computing the verdict"):
         served.campaign.refresh()
-        ended = [trial for trial in served.campaign.trials if trial.state != "open"]
-        return judge_trials(ended, served.threshold, served.certificate, served.campaign.provenance)
+        ended, known = served.campaign.trials.ended, served.campaign.provenance
+        return judge_trials(ended, served.threshold, served.certificate, known)
 
 
 def draw(served: ServedCampaign) -> Pictures:

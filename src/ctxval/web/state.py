@@ -165,7 +165,7 @@ class LiveCampaign(PageState):
     live = True
 
     def __init__(self, served: ServedCampaign, search: IntervalSearch | None) -> None:
-        super().__init__(served, Snapshot(served.campaign.recorder.trials))
+        super().__init__(served, Snapshot(served.campaign.trials))
         self._search = search
         self.hear = Innermost(functools.partial(self.post, self._progressed, "choosing"))
         self._drawn = self._cost = 0.0
@@ -216,7 +216,7 @@ class LiveCampaign(PageState):
 
     async def _watch(self) -> None:
         while True:
-            fresh = Snapshot(self.served.campaign.recorder.trials)
+            fresh = Snapshot(self.served.campaign.trials)
             if fresh.signature != self.snapshot.signature or fresh.trials.executions != self.snapshot.trials.executions:
                 self.snapshot = fresh
                 self.update()

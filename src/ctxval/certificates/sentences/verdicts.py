@@ -28,7 +28,7 @@ from ctxval.certificates.sentences.statements import condition_on_dynamics, cond
 from ctxval.certificates.sentences.withdrawals import REFINED
 from ctxval.core.learned_numbers import PushedDistances, Tolerance
 from ctxval.core.space import TaskSpace
-from ctxval.core.trial import Trial
+from ctxval.core.trial import Trial, Trials
 
 if TYPE_CHECKING:
     from ctxval.certificates.base import Certificate
@@ -280,7 +280,7 @@ def looked(known: Provenance, certificate: Certificate, tau: float, trials: Sequ
     stated = [each.threshold for each in known.thresholds or ()]
     before = stated[: stated.index(tau)] if tau in stated else stated
     smaller = sorted(each for each in before if each < tau and not certificate.covers(each, volume))
-    largest = max((trial.distance or 0.0 for trial in trials), default=0.0)
+    largest = Trials(trials).largest
     falsified_ones = [each for each in smaller if each < largest]
     for group, how in ((falsified_ones, "falsified"), (smaller[len(falsified_ones) :], "left undecided")):
         if group:
