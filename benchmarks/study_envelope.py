@@ -30,13 +30,15 @@ from study_auto import RESULTS
 
 STORED = JsonLines(RESULTS / "envelope.jsonl", ("system", "seed", "rule"))
 PAGE = Path(__file__).parents[1] / "docs" / "envelope.md"
-RULE = 9
+RULE = 10
 """The version of the method: 1 had one margin for all tasks, 2 did not check its interpolation, 3 stated no envelope if
 learned dynamics missed the distance of a test, on whichever side of the threshold, 4 executed the tests before the
 model was falsified, which cost the verdict of oblique-wall, 5 learned contacts as noise, 6 asked for a regular part
 only if there seemed to be noise, or a test was not explained, 7 trusted runs to places that no execution had entered,
-so that only campaigns on systems with positions differ from 8, and the others have its number, and 8 interpolated
-with one scale for all parameters, and with errors that further tasks could only enlarge."""
+so that only campaigns on systems with positions differ from 8, and the others have its number, 8 interpolated
+with one scale for all parameters, and with errors that further tasks could only enlarge, and 9 kept no executions for
+the tests of noisy systems until the model was falsified, so that only campaigns that lacked tests differ from 10."""
+LACKED = "predicted beforehand"  # in the doubt of a campaign that lacked tests
 COMPARABLE = 3  # later versions differ in what they do if learned dynamics miss a distance, and 4 in when it tests
 BUDGET, KEPT, CONFIDENCE = 15, 0.7, 0.95
 TASKS, NOISY_TASKS, REPEATS = 4000, 1000, 60
@@ -119,10 +121,12 @@ heavy-bin, hidden-heat, hidden-load, corner-stop, hidden-post, gate-at-post and 
 volume. Version 8 does not trust runs to places that no execution entered; it differs from 7 on boat-in-current,
 oblique-wall and taut-tether, which have positions. Version 7 found 97, 79 and 63 % there, version 8 found 85, 47 and
 46 %. The condition is that of a validation; without it, a patch of 0.12 m made 1.05 % of a puck's tasks falsely
-trusted. Version 9, the present one, interpolates better: its scales, columns, tasks at the boundary and errors were
+trusted. Version 9 interpolates better: its scales, columns, tasks at the boundary and errors were
 chosen on gripper-on-floor, moored-boat, rail-cars and corner-stop, after it was seen that the interpolation had lost
 most of what table-top and oblique-wall lacked. The last three contacts were added when the results of the others were
-known, and before their own were: no system of the reporting lists with contacts or backlash is left out.) Of each
+known, and before their own were: no system of the reporting lists with contacts or backlash is left out. Version 10,
+the present one, keeps executions for the tests of noisy systems, too, after seven campaigns of version 9 had lacked one
+to three tests; these were run again, and no other would change.) Of each
 system, 70 % of the tasks keep the threshold. "Found" is the share of these tasks that the envelope trusts; "false" is
 the share of all tasks that it trusts although their true distance is larger. True sets are known at {tasks} random
 tasks, of noisy systems at {noisy_tasks} tasks by {repeats} executions each.
@@ -151,6 +155,12 @@ def newest() -> list[dict[str, Any]]:
     return [line for (system, _), line in sorted(last.items()) if system in SYSTEMS]
 
 
+def is_known(system: str, seed: int) -> bool:
+    """Return whether a campaign is stored, by the present rule or by the one before if it would do the same."""
+    before = STORED.select(system=system, seed=seed, rule=9)
+    return (system, seed, RULE) in STORED or any(LACKED not in (line["doubt"] or "") for line in before)
+
+
 def write_page(page: Path = PAGE) -> None:
     """Write the page of the stored results."""
     results = newest()
@@ -168,16 +178,16 @@ def write_page(page: Path = PAGE) -> None:
         kind = " (contact)" if system in CONTACTS else ""
         middle = {name: float(np.median([line[name] for line in lines])) for name in ("found", "in_words", "seconds")}
         medians[system] = middle["found"]
-        executions = ", ".join(str(line["executions"]) for line in lines)
+        executions = [line["executions"] for line in lines]
         worst = max(lines, key=lambda line: line["false"])
         at_most = f"{worst['worst_false']:.2f}" if worst["false"] else "-"
-        rules = ", ".join(str(line["rule"]) for line in lines)
+        rules = ", ".join(map(str, sorted({line["rule"] for line in lines})))
         cells = [
             f"{system}{kind}",
             lines[0]["dimension"],
             len(lines),
             rules,
-            executions,
+            f"{min(executions)} to {max(executions)}" if min(executions) < max(executions) else executions[0],
             f"{100 * middle['found']:.0f} %",
         ]
         cells += [f"{100 * worst['false']:.1f} %", at_most, f"{100 * middle['in_words']:.0f} %"]
@@ -213,7 +223,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
     for seed in range(given.seeds):
         for system in given.systems:
-            if (system, seed, RULE) not in STORED:
+            if not is_known(system, seed):
                 result = study(system, seed)
                 STORED.append(result)
                 shown = {name: result[name] for name in ("executions", "found", "false", "factor", "doubt", "seconds")}

@@ -60,23 +60,27 @@ class CampaignDynamics:
         identity = [redefined, description.get("validation"), *validation.physical]
         text = json.dumps(identity, sort_keys=True)
         self.experiment = hashlib.sha256(text.encode()).hexdigest()[:16]
-        self.study = DynamicsStudy(validation, seed)
         self._store = store
         self.elsewhere: Callable[[], Sequence[Trajectory]] = tuple
         self.failure: str | None = None
+        self._use(DynamicsStudy(validation, seed))
+
+    def _use(self, study: DynamicsStudy) -> None:
+        self.study, self._learned = study, _Known(PREDICTIONS + 3)
         self._parts: tuple[str, bytes] | None = None  # of the study, when it learned first
-        self._learned: _Known = Latest(6)
+        # Predictions that no store has, by their trials: each verdict checks those of the last trials.
+        self._afterwards: Latest[Any, ExecutionPrediction | None] = Latest(2 * PREDICTIONS)
 
     def use_quantile(self, quantile: float) -> None:
         """State the share of the executions of a task that distances are about, if the system is noisy."""
         if quantile != self.study.quantile:
-            self.study, self._learned = self.study.anew(quantile), Latest(6)
+            self._use(self.study.anew(quantile))
 
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
         """Return what the completed trials, and unless ``alone`` other recordings teach; None if it is nothing."""
         executed, others = executed_trials(self._store, trials), () if alone else self.elsewhere()
         if self._parts is not None and self._parts != self.study.state_of_parts():  # they were changed in place
-            self.study, self._learned, self._parts = self.study.anew(), Latest(6), None
+            self._use(self.study.anew())
         # The other recordings are kept with what they taught, so that their identities stay theirs. A result may be
         # replaced, and then has another distance.
         key = (*((trial.number, trial.distance) for trial, _ in executed), *map(id, others))
@@ -246,7 +250,10 @@ class CampaignDynamics:
                 recent = place >= len(completed) - PREDICTIONS - 1
                 if not recent or self.learned(before, alone=True) is None:
                     continue
-                prediction = self.predict(before, trial.unit_point, alone=True)
+                key = tuple((each.number, each.distance) for each in completed[: place + 1])
+                if key not in self._afterwards:
+                    self._afterwards[key] = self.predict(before, trial.unit_point, alone=True)
+                prediction = self._afterwards[key]
             known = Trials(before).points(len(trial.unit_point))
             how: dict[str, Any] = {
                 "stored": stored is not None,

@@ -145,17 +145,14 @@ class EnvelopeSearch:
         return replace(evidence, predictions=tuple(tests))
 
     def reserved(self) -> Choice | None:
-        """Return a test if a distance exceeds the threshold, and the budget is just enough for the missing tests.
-
-        It is None if executions may differ by noise: then others may be needed to falsify the model.
-        """
+        """Return a test if a distance exceeds the threshold, and the budget is just enough for the missing tests."""
         interval, recorder, trials = self._interval, self._recorder, self._recorder.trials.ended
         if interval.best <= self._threshold or not interval.predicts or not recorder.has_tasks:
             return None
         known = self._known(trials)
         if known is None or not 0 < self._left <= known[1].tests - _stored_tests(recorder, trials):
             return None
-        return None if self._regular(trials, known[1]) is None else interval.test()
+        return interval.test()
 
     def choose(self) -> Choice | None:
         """Return the next task that enlarges the envelope, or a test of it; None if it would hardly grow.

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
+from ctxval._util.files import read_toml
 from ctxval._util.onnx_network import require_onnx
 from ctxval._util.refusals import reworded
 from ctxval._util.representation import task_text
@@ -351,7 +352,12 @@ def named_model(text: str, options: Mapping[str, Any], dt: float | None = None) 
         if options:
             of = "of" if path.suffix == ".toml" else "in"
             raise InputError(f"the model {of} {text} takes no options, got {', '.join(options)}.")
-        return read_model(path) if path.suffix == ".npz" else read_settings(text, {}).load().validation.model
+        if path.suffix == ".npz":
+            return read_model(path)
+        content = read_toml(path) if path.is_file() else {}
+        if set(content) == {"model"}:  # as `ctxval fit` writes it
+            return as_model(part("model", content["model"], path.parent))
+        return read_settings(text, {}).load().validation.model
     table: dict[str, Any] = {"type": text}
     if path.suffix == ".onnx":
         table = {"type": "Onnx", "source": text}

@@ -252,6 +252,7 @@ def unseen_parameters(planner: LoopPlanner, some: Array) -> tuple[int, ...]:
     loops: dict[int, Array] = {}
     for plan in planner.plan(ends):
         promised = np.concatenate([plan.promised.states[..., :-1, :], plan.promised.inputs], axis=-1)
+        promised[~np.isfinite(promised)] = np.nan  # M diverges
         loops.update(zip(plan.rows.tolist(), promised.reshape(len(plan.rows), *promised.shape[-2:]), strict=True))
     if not loops:
         return ()
@@ -261,5 +262,5 @@ def unseen_parameters(planner: LoopPlanner, some: Array) -> tuple[int, ...]:
         for j in range(d):
             low, high = loops.get(first + j), loops.get(first + d + j)
             if low is not None and high is not None and low.shape == high.shape:
-                effects[j] = max(effects[j], float(np.nanmax(np.abs(high - low) / size)))
+                effects[j] = max(effects[j], float(np.nanmax(np.abs(high - low) / size, initial=0.0)))
     return tuple(np.flatnonzero(effects < 0.02).tolist())
