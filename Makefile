@@ -11,7 +11,7 @@ export OMP_NUM_THREADS = 1
 unexport PYTHONDONTWRITEBYTECODE
 PIP := -m pip install --quiet --disable-pip-version-check --no-compile
 
-.PHONY: demo test suite quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo watch envelope safety causes clean
+.PHONY: demo test suite quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo watch envelope friction safety causes clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -114,6 +114,9 @@ watch: .venv/.test  ## does a watch notice that a system has changed? Writes doc
 
 envelope: .venv/.test  ## which part of the true set envelopes find; writes docs/envelope.md, and resumes
 	$(BIN)/python benchmarks/study_envelope.py
+
+friction: .venv/.test  ## how campaigns on systems with dry friction end; writes docs/dry-friction.md, and resumes
+	$(BIN)/python benchmarks/study_friction.py
 
 causes: .venv/.test  ## does `ctxval why` name the fault of a robot? Writes docs/how-to/causes.md, and resumes
 	$(BIN)/python benchmarks/study_causes.py development

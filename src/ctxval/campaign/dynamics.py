@@ -233,6 +233,7 @@ class CampaignDynamics:
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
             actuator=None if actuator is None else (actuator.delay, actuator.lag),
+            friction=learned.friction,
             physical=learned.study.given.physical,
             without_data=not learned.with_data,
             estimated=learned.study.given.outputs is not None,

@@ -79,6 +79,11 @@ def late(actuator: Sequence[float] | None) -> str:
     return f"acting {' and '.join(parts)}" if parts else ""
 
 
+def rubbing(friction: Mapping[str, float]) -> str:
+    """Return the dry friction at inputs, such as ``dry friction (torque 0.6 N m)``; empty if there is none."""
+    return f"dry friction ({with_units(friction)})" if friction else ""
+
+
 def except_for(physical: Sequence[str]) -> str:
     """Return the task parameters that dynamics may change with, after a comma; empty if there are none."""
     return f", except for {enumerated(physical, 10)}" if physical else ""

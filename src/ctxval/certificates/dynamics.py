@@ -38,7 +38,7 @@ from ctxval.errors import CertificateError
 # Attributes of the evidence that are numbers of the certificate as well.
 _COPIED = (
     *("noise", "quantile", "lags", "actuator", "physical", "suspect", "without_model", "without_data", "estimated"),
-    *("sharpness", "jump", "missed", "disagreement"),
+    *("friction", "sharpness", "jump", "missed", "disagreement"),
 )
 MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
 

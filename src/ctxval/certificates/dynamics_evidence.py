@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -94,6 +95,8 @@ class DynamicsEvidence(ShortRepr):
     quantile: float | None = None  #: share of the executions of a task that are below the maxima; None without noise
     lags: int = 0  #: number of earlier records and inputs that the learned dynamics depend on
     actuator: tuple[float, float] | None = None  #: delay and time constant of inputs in steps; None if they act at once
+    #: the largest dry friction at each input, in its units, by its label; empty if what M misses is smooth
+    friction: Mapping[str, float] = field(default_factory=dict)
     pocket: StatePocket | None = None  #: the largest region that no execution has entered; None if it is not known
     physical: tuple[str, ...] = ()  #: the task parameters that the learned dynamics depend on
     #: another one that they seem to depend on, and how many times less predictions of executions from the others err

@@ -40,7 +40,7 @@ def coverage(
     """
     visited, rows = _visited(posterior, loops), np.concatenate([tasks.rows for tasks in planned])
     width = np.maximum(np.ptp(np.quantile(visited, _MOSTLY, axis=(0, 1)), axis=0), 1e-9)
-    recorded, scaled = posterior.data.pairs / width, visited / width
+    recorded, scaled = posterior.data.recorded / width, visited / width
     beyond = _beyond(recorded, scaled)
     # Gaps between the records are looked for in a part of the tasks and of the steps.
     compared = _some(len(scaled), 256)
@@ -86,8 +86,8 @@ def beyond_records(
     """
     ends = np.quantile(_visited(posterior, of_pool), _MOSTLY, axis=(0, 1))
     width = np.maximum(np.ptp(ends, axis=0), 1e-9)
-    pairs = posterior.data.pairs[posterior.data.sources >= 0] if executed_only else posterior.data.pairs
-    recorded = pairs / width
+    data = posterior.data
+    recorded = (data.recorded[data.executed] if executed_only else data.recorded) / width
     return [_beyond(recorded, _visited(posterior, [each]) / width).max(axis=(1, 2)) for each in loops]
 
 

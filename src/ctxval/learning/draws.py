@@ -14,6 +14,7 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model, Step
+from ctxval.learning.dry_friction import DryFriction
 from ctxval.learning.kernel_expansion import KernelExpansion
 from ctxval.learning.residual_data import ResidualData
 
@@ -109,15 +110,24 @@ class DynamicsDraws(DrawsWithoutNoise):
         shape = x.shape
         of_each = math.prod(shape[:-1]) // len(self)
         x, u = (part.reshape(len(self), of_each, part.shape[-1]) for part in (x, u))  # there may be no inputs
+        acting = u[..., : self.data.inputs]
         with np.errstate(all="ignore"):
-            z = bounded(self.data.standardised(x, u))
-            parts = np.split(z, np.cumsum([len(each.weights) for each in self.expansions[:-1]], dtype=int))
-            learned = np.concatenate([each(part) for each, part in zip(self.expansions, parts, strict=True)])
-            if self.limit is not None:
-                learned = np.minimum(np.maximum(learned, -self.limit), self.limit)
-            residuals = np.zeros_like(x)
-            residuals[:, :, self.data.learned] = learned
-            return (self.model.step(x, u[..., : self.data.inputs]) + residuals * self.data.units).reshape(shape)
+            if isinstance(self.model, DryFriction):
+                following = self.model.following(x, acting, lambda inputs: self._residuals(x, inputs))
+            else:
+                following = self.model.step(x, acting) + self._residuals(x, u)
+            return following.reshape(shape)
+
+    def _residuals(self, x: Array, u: Array) -> Array:
+        """Return the residuals at pairs ``(S, q, n), (S, q, m)``."""
+        z = bounded(self.data.standardised(x, u))
+        parts = np.split(z, np.cumsum([len(each.weights) for each in self.expansions[:-1]], dtype=int))
+        learned = np.concatenate([each(part) for each, part in zip(self.expansions, parts, strict=True)])
+        if self.limit is not None:
+            learned = np.minimum(np.maximum(learned, -self.limit), self.limit)
+        residuals = np.zeros_like(x)
+        residuals[:, :, self.data.learned] = learned
+        return residuals * self.data.units
 
 
 @dataclass(frozen=True, eq=False)

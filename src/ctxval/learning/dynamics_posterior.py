@@ -24,6 +24,7 @@ from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 from ctxval.gp.cholesky import factorise, pivoted_rows
 from ctxval.learning.draws import DisturbedDynamics, DynamicsDraws, bounded
+from ctxval.learning.dry_friction import DryFriction
 from ctxval.learning.hyperparameters import (
     FAMILIES,
     SMOOTHER_FAMILIES,
@@ -272,7 +273,7 @@ def learn_covariances(
     if data is None:
         return None
     with single_threaded():
-        if settings.of_steps:
+        if settings.of_steps and not isinstance(model, DryFriction):
             with contextlib.suppress(InputError, np.linalg.LinAlgError):  # numbers too large for a linear model
                 smoother = smoother_than(data, settings.learned_from)
         if smoother is not None:

@@ -20,11 +20,12 @@ from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.actuators import Actuator, found_actuator
 from ctxval.learning.closed_loops import LoopPlanner, unseen_parameters
+from ctxval.learning.dry_friction import DryFriction, found_friction
 from ctxval.learning.dynamics_posterior import LearnedCovariances, PosteriorSettings, condition, learn_covariances
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
-from ctxval.learning.noise_study import NoiseStudy
+from ctxval.learning.noise_study import STRUCTURES, WITHOUT_LAGS, NoiseStudy
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, scheduled
 from ctxval.learning.regular import split_transitions
@@ -34,8 +35,11 @@ from ctxval.searches import Prediction
 
 _FEWEST_TOLD = 6  # executions from which on a task parameter is suspected of changing the dynamics
 _FEWEST_AGAINST = 3  # executions from which on the data that M was made from may be left out
+_FEWEST_HELD = 4  # executions from which on dry friction is looked for
 _WELL = 0.1  # left-out error below which neither these data nor task parameters are asked about
 _CLEARLY = 3.0  # factor by which predictions must err less without these data, or with a parameter, and err little
+_HALF = 0.5  # share of the left-out error of rates that dry friction must leave at most
+_KEPT = 2.0  # the same, of friction that was found before: single steps tell less of it than closed loops do
 _SLOW = 0.02  # seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores
 
 
@@ -50,6 +54,7 @@ class DynamicsStudy(ShortRepr):
             as further states; everything is learned of these.
         quantile: the share of the executions of a task that a distance is about, if the system is noisy.
         actuator: how the m inputs act; None if they act at once.
+        friction: M with the dry friction that it lacks, of which the residual is learned; None without.
     """
 
     def __init__(
@@ -58,8 +63,9 @@ class DynamicsStudy(ShortRepr):
         seed: int = 0,
         quantile: float = QUANTILE,
         extended: ExtendedValidation | None = None,
+        friction: DryFriction | None = None,
     ) -> None:
-        self.given, self.seed, self.quantile = validation, seed, quantile
+        self.given, self.seed, self.quantile, self.friction = validation, seed, quantile, friction
         self.extended = ExtendedValidation(validation) if extended is None else extended
         self.actuator, self.validation = self.extended.actuator, self.extended.validation
         self.planner = LoopPlanner(self.validation)
@@ -69,6 +75,7 @@ class DynamicsStudy(ShortRepr):
         self._others: dict[str, DynamicsStudy] = {}
         self._actuators: dict[bytes, Actuator | None] = {}
         self._actuated: DynamicsStudy | None = None
+        self._slowed: dict[bytes, DynamicsStudy | None] = {}
 
     def anew(self, quantile: float | None = None) -> DynamicsStudy:
         """Return a study of the same experiment that has learned nothing yet, with a quantile if it is given."""
@@ -116,6 +123,9 @@ class DynamicsStudy(ShortRepr):
                     acting = ExtendedValidation(self.given, actuator, executed[0][1].inputs.shape[-1])
                     self._actuated = DynamicsStudy(self.given, self.seed, self.quantile, acting)
                 return self._actuated.learn(executed) or learned
+            held = None if logged else self._with_friction(executed, learned)
+            if held is not None:
+                return held
             if not learned.left_out_error > _WELL:
                 return learned
             if (learned.posterior.data.sources == -1).any():
@@ -161,7 +171,7 @@ class DynamicsStudy(ShortRepr):
                 some = recorded if count == len(executed) else self._recorded(executed[:count], logged, with_data)
                 if some is None or self.extended.loops is None:
                     continue
-                model, seed = before_refinement(self.validation.model), (self.seed, count, 0)
+                model, seed = self.friction or before_refinement(self.validation.model), (self.seed, count, 0)
                 settings = PosteriorSettings.for_horizon(self.extended.loops.horizon)
                 self._covariances[key] = learn_covariances(model, *some, seed, settings)
             covariances = self._covariances[key]
@@ -202,7 +212,9 @@ class DynamicsStudy(ShortRepr):
     @functools.cached_property
     def noise(self) -> NoiseStudy:
         """Learns dynamics with noise."""
-        return NoiseStudy(self.extended, self.planner, self.search, self.seed, self.quantile)
+        # What friction does within a step would seem to be a history.
+        structures = STRUCTURES if self.friction is None else WITHOUT_LAGS
+        return NoiseStudy(self.extended, self.planner, self.search, self.seed, self.quantile, structures)
 
     def without(self, learned: LearnedDynamics, k: int) -> LearnedDynamics | None:
         """Return what all executions but one teach, with the same hyperparameters and structure of noise."""
@@ -284,6 +296,35 @@ class DynamicsStudy(ShortRepr):
         with single_threaded(), np.errstate(all="ignore"):
             return found_actuator(model, records_of, before, 30 if estimated else 80)
 
+    def _with_friction(self, executed: Executed, learned: LearnedDynamics) -> LearnedDynamics | None:
+        """Return what executions teach beside the dry friction that scheduled ones show; None if they show none.
+
+        Without friction, predictions of left-out executions must have erred once, and at least twice as much in rates.
+        """
+        if self.friction is not None or self.given.outputs is not None:
+            return None
+        study: DynamicsStudy | None = None
+        for some in (executed[:count] for count in range(_FEWEST_HELD, len(executed) + 1) if scheduled(count) == count):
+            key = digest(trajectory for _, trajectory in some)
+            if key not in self._slowed:
+                self._slowed[key] = study  # also if its search fails
+                extended = self.extended.executions(some)
+                known = (
+                    learned if len(some) == len(executed) else extended and self._learn(extended, (), with_data=True)
+                )
+                if extended and known and (study is not None or known.left_out_error > _WELL):
+                    recorded = self._recorded(extended, (), with_data=False)
+                    with single_threaded(), np.errstate(all="ignore"):
+                        model = before_refinement(self.validation.model)
+                        friction = None if recorded is None else found_friction(model, recorded[0])
+                    if friction is not None:
+                        tried = DynamicsStudy(self.given, self.seed, self.quantile, self.extended, friction)
+                        if study is not None or _error_of_rates(tried, some, known) < _HALF:
+                            self._slowed[key] = tried
+            study = self._slowed[key]
+        held = None if study is None else study.learn(executed)
+        return held if study is not None and _error_of_rates(study, executed, learned) < _KEPT else None
+
     def _most_telling(self, executed: Executed) -> tuple[str | None, float, float]:
         """Return the task parameter with which predictions err least, and the left-out errors with it and without."""
         name, least = None, np.inf
@@ -339,3 +380,16 @@ class DynamicsStudy(ShortRepr):
         if vectors is None or not isinstance(distance, ComposedDistance):
             return None
         return predict_composed(np.array([point for point, _ in executed]), vectors, distance.compose)
+
+
+def _error_of_rates(study: DynamicsStudy, executed: Executed, without: LearnedDynamics) -> float:
+    """Return the left-out error of the rates that friction slows, as a share of that without friction.
+
+    Where a joint stops within a step changes its position a little, which nothing predicts.
+    """
+    learned = study.learn(executed)
+    if learned is None or study.friction is None:
+        return np.inf
+    of_rates = [each.left_out_errors[study.friction.rates] for each in (learned, without)]
+    with_it, without_it = (float(np.sqrt((each**2).sum())) for each in of_rates)
+    return with_it / max(without_it, 1e-300)

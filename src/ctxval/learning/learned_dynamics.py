@@ -92,9 +92,14 @@ class LearnedDynamics(ShortRepr):
                         tasks.append((point, executed))
         return tasks
 
-    @functools.cached_property
+    @property
     def left_out_error(self) -> float:
         """The error of the next states of each execution, predicted from the others, as a share of the error of M."""
+        return float(np.sqrt((self.left_out_errors[self.posterior.data.learned] ** 2).mean()))
+
+    @functools.cached_property
+    def left_out_errors(self) -> Array:
+        """The same of each state ``(n,)``; 0 for those of which nothing is learned."""
         learned = self.posterior.data.learned
         without = self.posterior.means_without([[k] for k in range(len(self.executed))])
         errors, of_model = list[Array](), list[Array]()
@@ -102,7 +107,9 @@ class LearnedDynamics(ShortRepr):
             for model, of in ((without[k], errors), (self.study.validation.model, of_model)):
                 of.append((model.step(loop.states[:-1], loop.inputs) - loop.states[1:])[:, learned])
         scale = np.sqrt((np.concatenate(of_model) ** 2).mean(axis=0))
-        return float(np.sqrt(((np.concatenate(errors) / np.maximum(scale, 1e-300)) ** 2).mean()))
+        each = np.zeros(len(learned))
+        each[learned] = np.sqrt(((np.concatenate(errors) / np.maximum(scale, 1e-300)) ** 2).mean(axis=0))
+        return each
 
     @functools.cached_property
     def screened(self) -> WorstCase:
@@ -189,6 +196,13 @@ class LearnedDynamics(ShortRepr):
             f"{letter}[{i}]" if twice or label == f"{letter}{i}" else label
             for (letter, i), label in zip(coordinates, labels, strict=True)
         )
+
+    @property
+    def friction(self) -> dict[str, float]:
+        """The largest dry friction at the inputs that have some, by their labels."""
+        of_inputs, friction = self.labels[-self.posterior.data.inputs :], self.study.friction
+        sizes = [] if friction is None else friction.largest.tolist()
+        return {label: size for label, size in zip(of_inputs, sizes, strict=False) if size}
 
     @functools.cached_property
     def positions(self) -> list[list[int]]:

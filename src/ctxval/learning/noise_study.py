@@ -30,6 +30,7 @@ from ctxval.learning.worst_case import WorstCaseSearch
 STRUCTURES = (
     Structure(0), Structure(1), Structure(2), Structure(3), Structure(0, 3.0), Structure(0, 30.0), Structure(2, 30.0)
 )  # fmt: skip
+WITHOUT_LAGS = tuple(each for each in STRUCTURES if not each.lags)
 EXACT = 1e-3  # share of noise below which records with lags determine the next one
 NOISY = 0.01  # share of noise from which executions of one task differ
 _BETTER, _GOOD = 0.1, 0.02  # share of the error without a history, and of the residual, that a history leaves
@@ -44,9 +45,16 @@ class NoiseStudy:
     """Learns dynamics with noise and histories of one experiment; chosen structures are kept."""
 
     def __init__(
-        self, extended: ExtendedValidation, planner: LoopPlanner, search: WorstCaseSearch, seed: int, quantile: float
+        self,
+        extended: ExtendedValidation,
+        planner: LoopPlanner,
+        search: WorstCaseSearch,
+        seed: int,
+        quantile: float,
+        structures: Sequence[Structure] = STRUCTURES,
     ) -> None:
         self.extended, self.planner, self.search, self.seed, self.quantile = extended, planner, search, seed, quantile
+        self.structures = structures
         self._structures = Latest[bytes, ChosenStructure](8)
 
     def learn(self, posterior: DynamicsPosterior, records: Sequence[Record]) -> NoisyPosterior | None:
@@ -54,7 +62,7 @@ class NoiseStudy:
         # Executions do not follow from task, state and input if noise, or what is not recorded, acts.
         is_needed = float((posterior.most_probable.noise**2).max()) > NOISY or self._effect(posterior) > MATTERS
         is_needed = is_needed or self._effect(posterior, _scatter_of(records)) > MATTERS
-        if not is_needed and len(records) >= 3:
+        if not is_needed and len(records) >= 3 and any(each.lags for each in self.structures):
             last = records[-1]
             with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError), np.errstate(all="ignore"):
                 mean = posterior.means_without([[len(records) - 1]])
@@ -104,7 +112,7 @@ class NoiseStudy:
         try:
             with single_threaded(), np.errstate(all="ignore"):
                 model, pairs = posterior.covariances.model, self.extended.pairs
-                fit, chosen = fit_structures(model, records, pairs, data.learned, chosen)
+                fit, chosen = fit_structures(model, records, pairs, data.learned, chosen, self.structures)
         except (np.linalg.LinAlgError, InputError, ValueError):  # numbers that are not finite
             return None
         horizon, seed = max(len(record.inputs) for record in records), (self.seed, len(records))
@@ -155,7 +163,12 @@ class ChosenStructure(NamedTuple):
 
 
 def fit_structures(
-    model: Model, records: Sequence[Record], pairs: Array, live: Mask, chosen: ChosenStructure | None = None
+    model: Model,
+    records: Sequence[Record],
+    pairs: Array,
+    live: Mask,
+    chosen: ChosenStructure | None = None,
+    structures: Sequence[Structure] = STRUCTURES,
 ) -> tuple[InnovationsFit, ChosenStructure]:
     """Return the posterior of the most probable structure, or of a structure that was chosen before.
 
@@ -175,7 +188,7 @@ def fit_structures(
     if chosen is not None:
         plain = lagged(Structure(0 if chosen.structure.ratio else chosen.structure.lags), chosen.theta)
         return (filtered(chosen.structure, plain) if chosen.structure.ratio else plain), chosen
-    possible = [structure for structure in STRUCTURES if structure.lags <= max(1, len(records))]
+    possible = [structure for structure in structures if structure.lags <= max(1, len(records))]
     fits: list[InnovationsFit] = [lagged(structure, None) for structure in possible if not structure.ratio]
     of_states, least = fits[0], min(fit.share for fit in fits)
     exact = [fit for fit in fits if fit.share <= max(10 * least, 1e-6)] if least <= EXACT else []

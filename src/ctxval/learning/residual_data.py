@@ -14,6 +14,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
+from ctxval.learning.dry_friction import DryFriction
 from ctxval.learning.hyperparameters import FAMILIES, ResidualKernel, climbed, learning_rows
 from ctxval.models.increments import standard_deviations, standardised_pairs
 from ctxval.models.linear import Linear
@@ -37,6 +38,10 @@ class ResidualData:
     units: Array  # the unit of each standardised residual; 0 if it is negligible, (n,)
     inputs: int  # the number m of inputs of the system
     transitions: Transitions
+    # recorded: all standardised pairs, also of joints that friction holds, with the inputs before friction, (R, n + m)
+    # executed: which of them are of executions, (R,)
+    recorded: Array
+    executed: Mask
 
     def standardised(self, x: Array, u: Array) -> Array:
         """Return standardised pairs ``(..., n + m)`` of states and the first m inputs, which act."""
@@ -45,6 +50,10 @@ class ResidualData:
 
 def residual_data(model: Model, transitions: Transitions, sources: Rows) -> ResidualData | None:
     """Return the residuals of a model; None if fewer than two transitions are usable, or if M explains all of them."""
+    recorded, of = np.concatenate([transitions.x, transitions.u], axis=1), sources
+    if isinstance(model, DryFriction):
+        acting, moving = model.acting(transitions)
+        model, transitions, sources = model.model, acting[moving], sources[moving]
     with np.errstate(all="ignore"):
         residuals = transitions.x_next - model.step(transitions.x, transitions.u)
         steps = transitions.x_next - transitions.x
@@ -72,6 +81,8 @@ def residual_data(model: Model, transitions: Transitions, sources: Rows) -> Resi
         units=np.where(learned, sizes, 0.0),
         inputs=transitions.u.shape[1],
         transitions=transitions[usable],
+        recorded=(recorded - shift)[(np.abs(recorded) < 1e100).all(axis=1)] / scale,
+        executed=of[(np.abs(recorded) < 1e100).all(axis=1)] >= 0,
     )
 
 

@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 from ctxval._util.representation import counted
 from ctxval._util.texts import enumerated
-from ctxval.certificates.bounds import at_most, except_for, late, of_tasks, percent, state_of, with_error, with_units
+from ctxval.certificates.bounds import (
+    at_most,
+    except_for,
+    late,
+    of_tasks,
+    percent,
+    rubbing,
+    state_of,
+    with_error,
+    with_units,
+)
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.sample import Sample, listed
 
@@ -224,6 +234,7 @@ def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
     return (
         complete,
         *([f"inputs act alike in every task: {acting.removeprefix('acting ')}"] if acting else []),
+        *([f"{friction} is the same everywhere"] if (friction := rubbing(evidence.friction)) else []),
         alike,
         f"{prior}; its hyperparameters are unknown and integrated over",
         *(_WITHOUT_DATA if evidence.without_data else ()),
@@ -241,19 +252,21 @@ def condition_on_dynamics(details: Mapping[str, Any]) -> str:
     physical = details["physical"]
     state, acting = state_of(details["estimated"]), late(details["actuator"])
     acting = f" ({acting})" if acting else ""
+    friction = f"{rubbing(details['friction'])} and " if details["friction"] else ""
     lags = f" of the last {details['lags'] + 1} steps" if details["lags"] else ""
     recorded = [f"{state.replace('state', 'states', 1)} and inputs{lags}{acting}"]
     if details["quantile"] is not None:
         return (
-            f" with noise, if what M misses is a smooth function of {enumerated([*recorded, *physical], 10)}, the same "
-            "in every task and over time, and noise is independent from step to step and like that of the records"
+            f" with noise, if what M misses is {friction}a smooth function of "
+            f"{enumerated([*recorded, *physical], 10)}, the same in every task and over time, and noise is independent "
+            "from step to step and like that of the records"
         )
     if not lags:
         recorded = [state, f"input{acting}"] if physical else [f"{state} and input{acting}"]
     missed = "the system" if details["without_model"] else "what M misses"
     return (
-        f", if {missed} is one smooth function of {enumerated([*recorded, *physical], 10)}, the same in every task and "
-        "over time"
+        f", if {missed} is {friction}one smooth function of {enumerated([*recorded, *physical], 10)}, the same in "
+        "every task and over time"
     )
 
 
@@ -278,6 +291,7 @@ def conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
     return [
         complete,
         *([f"the inputs {acting} in every task, as in the executions"] if acting else []),
+        *([f"{friction} being the same everywhere"] if (friction := rubbing(details["friction"])) else []),
         alike,
         "its dynamics in the gaps of the records being like those beside the gaps (at most "
         f"{with_units(details['resolution'])} wide in single coordinates, wider in several at once)",

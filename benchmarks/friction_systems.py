@@ -1,0 +1,193 @@
+"""Systems with dry friction that M lacks: drives, cranes and arms, of 2 to 4 parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ctxval import Experiment, Task, TaskSpace, controllers, distances, models, systems
+from ctxval._util.arrays import Array
+from dynamics_systems import experiment
+from strangers import row
+
+GRAVITY = 9.81
+DEVELOPMENT = ("geared-pendulum", "ball-screw", "frictionloss-arm")
+"""Systems that the method was developed on."""
+REGULAR = ("cart-pole", "gantry", "scara")
+"""Others whose friction is of constant size."""
+OTHERS = ("worn-guide", "loaded-gear")
+"""Others whose friction changes with the place or the load."""
+
+Push = Callable[[Array, Array, Array], Array]
+"""The accelerations ``(..., k)`` at positions, speeds and inputs."""
+
+
+def mechanism(push: Push, dt: float, substeps: int = 1) -> models.Function:
+    """Return the model of positions and speeds, by semi-implicit Euler steps."""
+
+    def step(x: Array, u: Array) -> Array:
+        k = x.shape[-1] // 2
+        places, speeds = x[..., :k], x[..., k:]
+        for _ in range(substeps):
+            speeds = speeds + dt / substeps * push(places, speeds, u)
+            places = places + dt / substeps * speeds
+        return np.concatenate([places, speeds], axis=-1)
+
+    return models.Function(step, vectorized=True)
+
+
+def coulomb(speed: Array, slow: float = 0.002) -> Array:
+    """Return a dry friction of size 1, which is viscous at speeds far below ``slow``."""
+    return np.tanh(speed / slow)
+
+
+def pair(
+    name: str, units: str, space: TaskSpace, system: Push, model: Push, horizon: int, dt: float,
+    Q: list[float], R: float, compared: tuple[int, ...], inputs: int = 1, substeps: int = 100,
+) -> Experiment:  # fmt: skip
+    """Return an experiment whose tasks begin at rest at ``start`` and end at ``goal``; other places are 0."""
+
+    def task(p: object) -> Task:
+        names = space.names
+        first = [getattr(p, each) for each in names if each.startswith("start")]
+        last = [getattr(p, each) for each in names if each.startswith("goal")]
+        states = len(Q)
+        first = first or [0.0 * each for each in last]
+        zeros = [0.0 * last[0]] * (states - len(last))
+        return Task(row(*first, *zeros), goal=row(*last, *zeros), horizon=horizon, dt=dt)
+
+    return experiment(
+        name,
+        units,
+        space=space,
+        task=task,
+        system=systems.Simulated(mechanism(system, dt, substeps)),
+        model=mechanism(model, dt),
+        synthesizer=controllers.LQR(Q, [R] * inputs),
+        distance=distances.MaximumDeviation(components=compared),
+    )
+
+
+def geared_pendulum(load: float = 1.08, friction: float = 0.7) -> Push:
+    """A pendulum with a gear; its load is 8 % heavier than that of M."""
+    return lambda q, w, u: (u - 0.15 * w - load * 0.08 * GRAVITY * np.sin(q) - friction * coulomb(w)) / load
+
+
+def ball_screw(rest: float = 0.25, friction: float = 0.4) -> Push:
+    """An axis whose friction is larger at rest than in motion (Stribeck)."""
+    return lambda q, w, u: u - 0.5 * w - (friction + rest * np.exp(-((w / 0.05) ** 2))) * coulomb(w)
+
+
+def cart_pole(friction: float = 0.6) -> Push:
+    """A pole on a cart with dry friction at its wheels."""
+
+    def push(q: Array, w: Array, u: Array) -> Array:
+        s, c = np.sin(q[..., 1]), np.cos(q[..., 1])
+        force = u[..., 0] - 0.2 * w[..., 0] - friction * coulomb(w[..., 0])
+        moved = (force + 0.1 * s * (0.5 * w[..., 1] ** 2 - GRAVITY * c)) / (1.0 + 0.1 * s**2)
+        return np.stack([moved, (GRAVITY * s - moved * c) / 0.5 - 0.05 * w[..., 1]], axis=-1)
+
+    return push
+
+
+def gantry(friction: float = 1.0, drag: float = 0.4) -> Push:
+    """A trolley with a hanging load; M takes its drag for smaller."""
+
+    def push(q: Array, w: Array, u: Array) -> Array:
+        s, c = np.sin(q[..., 1]), np.cos(q[..., 1])
+        force = u[..., 0] - drag * w[..., 0] - friction * coulomb(w[..., 0])
+        moved = (force + 0.5 * s * (w[..., 1] ** 2 + GRAVITY * c)) / (2.0 + 0.5 * s**2)
+        return np.stack([moved, -(GRAVITY * s + moved * c) - 0.05 * w[..., 1]], axis=-1)
+
+    return push
+
+
+def scara(load: float = 0.55, friction: tuple[float, float] = (0.5, 0.2)) -> Push:
+    """Two joints in a horizontal plane; the load is 10 % heavier than that of M."""
+
+    def push(q: Array, w: Array, u: Array) -> Array:
+        c, s = np.cos(q[..., 1]), np.sin(q[..., 1])
+        near, far = 0.6 + load * (0.32 + 0.32 * c), load * (0.16 + 0.16 * c)
+        own, bent = 0.1 + 0.16 * load, 0.16 * load * s
+        first = u[..., 0] + bent * (2 * w[..., 0] * w[..., 1] + w[..., 1] ** 2)
+        first = first - 0.3 * w[..., 0] - friction[0] * coulomb(w[..., 0])
+        second = u[..., 1] - bent * w[..., 0] ** 2 - 0.1 * w[..., 1] - friction[1] * coulomb(w[..., 1])
+        whole = near * own - far**2
+        return np.stack([own * first - far * second, near * second - far * first], axis=-1) / whole[..., None]
+
+    return push
+
+
+def worn_guide(worn: float = 1.2, friction: float = 0.4) -> Push:
+    """An axis whose friction is three times as large in 6 % of its range."""
+    return lambda q, w, u: u - 0.5 * w - np.where((q > 0.5) & (q < 0.74), worn, friction) * coulomb(w)
+
+
+def loaded_gear(share: float = 0.15, friction: float = 0.2) -> Push:
+    """An axis whose friction grows with the torque that it transmits."""
+    return lambda q, w, u: u - 0.5 * w - (friction + share * np.abs(u)) * coulomb(w)
+
+
+def arm_xml(friction: tuple[float, float]) -> str:
+    """Return an arm of MuJoCo with two joints, with dry friction or without."""
+    joint = '<joint name="{}" axis="0 0 1" damping="{}" frictionloss="{}"/>'
+    return (
+        '<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>'
+        f"<body>{joint.format('shoulder', 0.4, friction[0])}"
+        '<geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03" mass="1.2"/>'
+        f'<body pos="0.4 0 0">{joint.format("elbow", 0.2, friction[1])}'
+        '<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="0.8"/></body></body></worldbody>'
+        '<actuator><motor joint="shoulder"/><motor joint="elbow"/></actuator></mujoco>'
+    )
+
+
+def frictionloss_arm() -> Experiment:
+    """Return MuJoCo's arm with ``frictionloss``; M is the same file without it."""
+    return experiment(
+        "frictionloss-arm",
+        "rad",
+        space=TaskSpace(goal_shoulder=(-1.2, 1.2, "rad"), goal_elbow=(-1.2, 1.2, "rad")),
+        task=lambda p: Task(np.zeros(4), goal=[p.goal_shoulder, p.goal_elbow, 0.0, 0.0], horizon=75, dt=0.02),
+        system=systems.MuJoCo(arm_xml((0.5, 0.2)), substeps=10),
+        model=models.MuJoCo(arm_xml((0.0, 0.0)), dt=0.02),
+        synthesizer=controllers.LQR([20.0, 20.0, 1.0, 1.0], [0.1, 0.1]),
+        distance=distances.MaximumDeviation(components=(0, 1)),
+    )
+
+
+def _moves(unit: str, start: float, goal: float, *, of: str = "") -> dict[str, tuple[float, float, str]]:
+    return {f"start{of}": (-start, start, unit), f"goal{of}": (-goal, goal, unit)}
+
+
+SYSTEMS: dict[str, Callable[[], Experiment]] = {
+    "geared-pendulum": lambda: pair(
+        "geared-pendulum", "rad", TaskSpace(**_moves("rad", 1.0, 1.2)),
+        geared_pendulum(), geared_pendulum(1.0, 0.0), 60, 0.03, [30.0, 3.0], 0.2, (0,),
+    ),
+    "ball-screw": lambda: pair(
+        "ball-screw", "m", TaskSpace(**_moves("m", 1.0, 2.0)),
+        ball_screw(), ball_screw(0.0, 0.0), 60, 0.04, [10.0, 1.0], 0.5, (0,),
+    ),
+    "cart-pole": lambda: pair(
+        "cart-pole", "m", TaskSpace(**_moves("m", 0.5, 1.0)),
+        cart_pole(), cart_pole(0.0), 100, 0.03, [20.0, 20.0, 5.0, 2.0], 0.5, (0,),
+    ),
+    "gantry": lambda: pair(
+        "gantry", "m", TaskSpace(**_moves("m", 1.0, 2.0)),
+        gantry(), gantry(0.0, 0.3), 120, 0.05, [20.0, 10.0, 5.0, 1.0], 0.2, (0, 1),
+    ),
+    "scara": lambda: pair(
+        "scara", "rad", TaskSpace(**_moves("rad", 1.0, 1.2, of="_1"), **_moves("rad", 1.0, 1.2, of="_2")),
+        scara(), scara(0.5, (0.0, 0.0)), 60, 0.03, [30.0, 30.0, 2.0, 2.0], 0.2, (0, 1), 2,
+    ),
+    "frictionloss-arm": frictionloss_arm,
+    "worn-guide": lambda: pair(
+        "worn-guide", "m", TaskSpace(**_moves("m", 1.0, 2.0)),
+        worn_guide(), worn_guide(0.0, 0.0), 60, 0.04, [10.0, 1.0], 0.5, (0,),
+    ),
+    "loaded-gear": lambda: pair(
+        "loaded-gear", "m", TaskSpace(**_moves("m", 1.0, 2.0)),
+        loaded_gear(), loaded_gear(0.0, 0.0), 60, 0.04, [10.0, 1.0], 0.5, (0,),
+    ),
+}  # fmt: skip

@@ -1,0 +1,138 @@
+"""Dry friction that M lacks is found in executions, and predictions with it are accurate where joints stop."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
+
+from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, systems
+from ctxval._util.arrays import Array
+from ctxval.core.trajectory import Transitions
+from ctxval.learning import DynamicsStudy
+from ctxval.learning.dry_friction import DryFriction, found_friction
+from rig_thorough import more
+
+H, DT, GRIP = 40, 0.05, 0.8
+MASS = np.array([[2.0, 0.6], [0.6, 1.0]])
+MODEL = models.Linear(np.array([[1.0, DT], [0.0, 1.0]]), np.array([[0.0], [DT]]))
+JOINTS = models.Linear(np.eye(2), DT * np.linalg.inv(MASS))  # rates of two joints on which torques act
+
+
+def sticky_step(x: Array, u: Array, grip: float = GRIP) -> Array:
+    """A cart with drag and dry friction, of 40 short steps, so that it may stop within a step."""
+    position, speed = x[..., 0], x[..., 1]
+    dt = DT / 40
+    for _ in range(40):
+        free = speed + dt * (u[..., 0] - 0.3 * speed)
+        speed = np.sign(free) * np.maximum(np.abs(free) - dt * grip, 0.0)
+        position = position + dt * speed
+    return np.stack([position, speed], axis=-1)
+
+
+def recorded(step: Any, count: int = 300, inputs: int = 1) -> Transitions:
+    rng = np.random.default_rng(0)
+    x, u = rng.normal(size=(count, 2)), 2 * rng.normal(size=(count, inputs))
+    x[::3, 1] = 0.0
+    return Transitions(x, u, step(x, u))
+
+
+@given(st.floats(-3, 3), st.floats(-3, 3), st.floats(0, 4))
+def test_friction_slows_a_rate_and_never_turns_it(speed: float, push: float, grip: float) -> None:
+    held = DryFriction(MODEL, np.array([1]), np.array([grip]), np.zeros(1), np.array([1e-3]))
+    free = speed + DT * push
+    after = held.step(np.array([0.0, speed]), np.array([push]))[1]
+    assert after == pytest.approx(np.sign(free) * max(abs(free) - DT * grip, 0.0), abs=1e-9)
+
+
+@given(st.lists(st.floats(-3, 3), min_size=4, max_size=4), st.floats(0, 5), st.floats(0, 5))
+def test_coupled_frictions_are_those_of_the_quadratic_program(values: list[float], first: float, second: float) -> None:
+    rates, torques, largest = np.array(values[:2]), np.array(values[2:]), np.array([first, second]) + 1e-6
+    held = DryFriction(JOINTS, np.array([0, 1]), largest, np.zeros(2), np.array([1e-3, 1e-3]))
+    root = np.linalg.cholesky(DT * np.linalg.inv(MASS))
+    solved = lsq_linear(root.T, np.linalg.solve(root, JOINTS.step(rates, torques)), (-largest, largest), tol=1e-14)
+    expected = JOINTS.step(rates, torques - solved.x)
+    np.testing.assert_allclose(held.step(rates, torques), expected, rtol=0, atol=1e-5)
+
+
+def test_its_size_is_found_beside_another_error_of_the_model() -> None:
+    friction = found_friction(MODEL, recorded(sticky_step))
+    assert friction is not None
+    assert friction.rates.tolist() == [1]
+    assert friction.largest[0] == pytest.approx(GRIP, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "transitions",
+    [
+        recorded(MODEL.step),
+        recorded(lambda x, u: sticky_step(x, u, 0.0)),
+        Transitions(np.ones((5, 2)), np.zeros((5, 1)), np.ones((5, 2))),
+        Transitions(np.ones((5, 2)), np.zeros((5, 0)), np.ones((5, 2))),
+    ],
+    ids=["exact", "smooth", "without inputs", "no input"],
+)
+def test_none_is_found_where_there_is_none(transitions: Transitions) -> None:
+    assert found_friction(MODEL, transitions) is None
+
+
+def test_a_joint_that_creeps_while_it_is_held_is_found_to_do_so() -> None:
+    def creeping(x: Array, u: Array) -> Array:
+        speed = x[..., 1] + DT * u[..., 0]
+        held = np.abs(speed - 0.004 * u[..., 0]) <= DT * GRIP  # friction is what the input exceeds the creep by
+        slowed = np.where(held, 0.004 * u[..., 0], speed - DT * GRIP * np.sign(speed))
+        return np.stack([x[..., 0] + DT * slowed, slowed], axis=-1)
+
+    rng = np.random.default_rng(0)
+    moving, resting = 2 * rng.normal(size=(200, 2)), np.stack([rng.normal(size=100), np.zeros(100)], -1)
+    x, u = np.concatenate([moving, resting]), np.concatenate([2 * rng.normal(size=200), rng.uniform(-0.7, 0.7, 100)])
+    friction = found_friction(MODEL, Transitions(x, u[:, None], creeping(x, u[:, None])))
+    assert friction is not None
+    assert friction.largest[0] == pytest.approx(GRIP, rel=0.02)
+    assert friction.creep[0] == pytest.approx(0.004, rel=0.1)
+    np.testing.assert_allclose(friction.step(resting, u[200:, None]), creeping(resting, u[200:, None]), atol=4e-4)
+
+
+def test_two_inputs_of_one_rate_have_no_friction_of_their_own() -> None:
+    twice = models.Linear(np.array([[1.0, DT], [0.0, 1.0]]), np.array([[0.0, 0.0], [DT, DT]]))
+    assert found_friction(twice, recorded(lambda x, u: sticky_step(x, u.sum(axis=-1, keepdims=True)), inputs=2)) is None
+
+
+def cart() -> Validation:
+    return Validation(
+        space=TaskSpace(goal=(-2.0, 2.0, "m"), start=(-1.0, 1.0, "m")),
+        task=lambda p: Task(
+            np.stack([p.start, 0 * p.start], -1), goal=np.stack([p.goal, 0 * p.goal], -1), horizon=H, dt=DT
+        ),
+        system=systems.Simulated(sticky_step, vectorized=True),
+        model=MODEL,
+        synthesizer=controllers.LQR([10.0, 1.0], [1.0]),
+        distance=distances.MaximumDeviation(components=(0,)),
+    )
+
+
+def test_runs_that_stop_short_are_predicted_from_four_executions() -> None:
+    validation, study = cart(), DynamicsStudy(cart())
+    points = np.random.default_rng(0).random((12, 2))
+    runs = [validation.outcome(validation.space.from_unit(point)) for point in points]
+    learned = study.learn([(point, run.system_trajectory) for point, run in zip(points[:4], runs, strict=False)])
+    assert learned is not None
+    assert learned.study.friction is not None
+    assert learned.friction == {"u[0]": pytest.approx(GRIP, rel=0.02)}
+    assert learned.noisy is None  # what friction does within a step is no history
+    expected, distances_ = learned.expected(points[4:]), [run.distance for run in runs[4:]]
+    np.testing.assert_allclose(expected, distances_, rtol=0, atol=0.05 * max(distances_))
+
+
+@pytest.mark.parametrize("seed", more(0, 1, 2))
+def test_a_model_without_friction_is_validated_and_the_verdict_names_it(seed: int) -> None:
+    validation = cart()
+    largest = float(np.max(validation.distances(validation.space.from_unit(np.random.default_rng(1).random((400, 2))))))
+    verdict = Campaign(validation, seed=seed).run(25, threshold=1.25 * largest).verdict(1.25 * largest)
+    assert verdict.answer == "validated"
+    assert "if what M misses is dry friction (u[0] 0." in str(verdict)
+    assert Campaign(validation, seed=seed).run(25, threshold=0.9 * largest).verdict(0.9 * largest).answer == "falsified"
