@@ -81,10 +81,13 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
     if not (np.isfinite(of_friction).all() and np.isfinite(sizes).all() and (sizes > 0).all()):
         return None
     linear = np.linalg.qr(features)[0]
-    left = (residuals - linear @ (linear.T @ residuals)) / sizes
-    explained = (of_friction - np.einsum("ik,kjl->ijl", linear, np.einsum("ik,ijl->kjl", linear, of_friction))) / sizes[
-        :, None
-    ]
+
+    def beside_linear(values: Array) -> Array:
+        flat = values.reshape(len(values), -1)
+        return (flat - linear @ (linear.T @ flat)).reshape(values.shape)
+
+    left = beside_linear(residuals / sizes)
+    explained = beside_linear(of_friction / sizes[:, None])
     largest, rest = nnls(explained.reshape(-1, len(rates)), left.ravel())
     if not rest**2 < _EXPLAINED * (left**2).sum():
         return None

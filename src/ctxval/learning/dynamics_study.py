@@ -117,7 +117,7 @@ class DynamicsStudy(ShortRepr):
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
             if learned is None or len(executed) < _FEWEST_AGAINST:
                 return learned
-            actuator = None if logged else self._found_actuator(executed, learned)
+            actuator = None if logged or self.friction else self._found_actuator(executed, learned)
             if actuator is not None:
                 if self._actuated is None or self._actuated.actuator != actuator:
                     acting = ExtendedValidation(self.given, actuator, executed[0][1].inputs.shape[-1])
@@ -319,11 +319,11 @@ class DynamicsStudy(ShortRepr):
                         friction = None if recorded is None else found_friction(model, recorded[0])
                     if friction is not None:
                         tried = DynamicsStudy(self.given, self.seed, self.quantile, self.extended, friction)
-                        if study is not None or _error_of_rates(tried, some, known) < _HALF:
+                        if study is not None or _error_of_rates(tried.learn(some), known) < _HALF:
                             self._slowed[key] = tried
             study = self._slowed[key]
         held = None if study is None else study.learn(executed)
-        return held if study is not None and _error_of_rates(study, executed, learned) < _KEPT else None
+        return held if _error_of_rates(held, learned) < _KEPT else None
 
     def _most_telling(self, executed: Executed) -> tuple[str | None, float, float]:
         """Return the task parameter with which predictions err least, and the left-out errors with it and without."""
@@ -382,14 +382,13 @@ class DynamicsStudy(ShortRepr):
         return predict_composed(np.array([point for point, _ in executed]), vectors, distance.compose)
 
 
-def _error_of_rates(study: DynamicsStudy, executed: Executed, without: LearnedDynamics) -> float:
-    """Return the left-out error of the rates that friction slows, as a share of that without friction.
+def _error_of_rates(held: LearnedDynamics | None, without: LearnedDynamics) -> float:
+    """Return the left-out error of the rates that friction slows, as a share of that without it; infinity for None.
 
     Where a joint stops within a step changes its position a little, which nothing predicts.
     """
-    learned = study.learn(executed)
-    if learned is None or study.friction is None:
+    if held is None or held.study.friction is None:
         return np.inf
-    of_rates = [each.left_out_errors[study.friction.rates] for each in (learned, without)]
+    of_rates = [each.left_out_errors[held.study.friction.rates] for each in (held, without)]
     with_it, without_it = (float(np.sqrt((each**2).sum())) for each in of_rates)
     return with_it / max(without_it, 1e-300)
