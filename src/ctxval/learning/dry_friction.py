@@ -21,7 +21,7 @@ from ctxval.core.trajectory import Transitions
 from ctxval.models.increments import standard_deviations
 
 _TIMES = 2  # the residual is evaluated at forces that follow from it
-_SWEEPS = 12  # of the inputs, whose frictions act on each other's rates
+_SWEEPS = 4  # each time, of the inputs, whose frictions act on each other's rates
 _EXPLAINED = 0.7  # share of the squared residuals, beside a linear function, that must be left at most
 _REST = 0.05  # share of the root mean square of a rate below which the joint is at rest
 _PER_COEFFICIENT = 5  # fewest recorded steps for each coefficient of the linear function
@@ -46,10 +46,21 @@ class DryFriction:
         reached, effects = _reached(self.model, x, u, self.change)
         force, residuals = np.zeros_like(u), np.zeros_like(reached)
         for _ in range(_TIMES):  # what is missed depends on the force, which it changes little
-            force = _force(reached + residuals, effects, self.rates, self.largest, self.creep)
+            force = self._force(reached + residuals, effects, force)
             residuals = missed(u - force)
-        force = _force(reached + residuals, effects, self.rates, self.largest, self.creep)
+        force = self._force(reached + residuals, effects, force)
         return np.asarray(reached + residuals - (effects * force[..., None, :]).sum(axis=-1))
+
+    def _force(self, reached: Array, effects: Array, force: Array) -> Array:
+        """Return the friction ``(..., m)`` that holds joints, but for their creep, if it can, from a first guess."""
+        m, of_rates, force = len(self.rates), effects[..., self.rates, :], force.copy()
+        with np.errstate(all="ignore"):  # states of draws that diverge
+            for j in [*range(m)] * (_SWEEPS if m > 1 else 1):  # projected Gauss-Seidel
+                own = of_rates[..., j, j]
+                rate = reached[..., self.rates[j]] - (of_rates[..., j, :] * force).sum(axis=-1)
+                holding = (rate + own * force[..., j]) / (own + np.sign(own) * self.creep[j])
+                force[..., j] = np.clip(np.nan_to_num(holding), -self.largest[j], self.largest[j])
+        return force
 
     def acting(self, transitions: Transitions) -> tuple[Transitions, Mask]:
         """Return transitions with the inputs that act, and of which the friction is known ``(N,)``: all joints move."""
@@ -119,16 +130,3 @@ def _reached(model: Model, x: Array, u: Array, change: Array) -> tuple[Array, Ar
     inputs = u + changes
     each = model.step(np.array(np.broadcast_to(x, (*inputs.shape[:-1], x.shape[-1]))), inputs)
     return each[0], np.moveaxis(each[1:] - each[0], 0, -1) / change
-
-
-def _force(reached: Array, effects: Array, rates: Rows, largest: Array, creep: Array) -> Array:
-    """Return the friction ``(..., m)`` that holds joints, but for their creep, if it can (projected Gauss-Seidel)."""
-    m, of_rates = len(rates), effects[..., rates, :]
-    force = np.zeros((*reached.shape[:-1], m))
-    with np.errstate(all="ignore"):  # states of draws that diverge
-        for _ in range(_SWEEPS if m > 1 else 1):
-            for j in range(m):
-                own, rate = of_rates[..., j, j], reached[..., rates[j]] - (of_rates[..., j, :] * force).sum(axis=-1)
-                holding = np.nan_to_num((rate + own * force[..., j]) / (own + np.sign(own) * creep[j]))
-                force[..., j] = np.clip(holding, -largest[j], largest[j])
-    return force
