@@ -69,9 +69,9 @@ method was developed on three of them (a geared pendulum, a ball screw with Stri
 `frictionloss`), and nothing was tuned on the others: a cart-pole, a gantry, a SCARA robot, and two axes whose friction
 is not of constant size. d* is the largest distance over {tasks:,} random tasks.
 
-**At 1.25 d\\*, {found} campaigns on the other systems with constant friction were validated; without looking for
-friction, {before}. On the systems of the development, these were {developed} and {developed_before}. At 0.95 d\\*,
-{false} of {below} campaigns on all systems were validated, which is false.**
+**At 1.25 d\\*, {found} campaigns on the other systems with constant friction were validated;
+without looking for friction, {before}. On the systems of the development, these were {developed} and
+{developed_before}. At 0.95 d\\*, {false} of {below} campaigns on all systems were validated, which is false.**
 
 {table}
 
@@ -101,11 +101,8 @@ def write_page(page: Path = PAGE) -> None:
         cells = [system]
         for looked_for in (True, False):
             of = lines(1.25, looked_for, system)
-            cells += [
-                f"{len(validated(of))} of {len(of)}",
-                f"{median(of, 'executions'):g}",
-                f"{median(of, 'seconds'):.0f}",
-            ]
+            numbers = [f"{median(of, 'executions'):g}", f"{median(of, 'seconds'):.0f}"] if of else ["-", "-"]
+            cells += [f"{len(validated(of))} of {len(of)}" if of else "not run", *numbers]
             if looked_for:
                 sizes = [list(line["friction"].values()) for line in of if line["friction"]]
                 alike = [each for each in sizes if len(each) == max(map(len, sizes))]
@@ -118,7 +115,7 @@ def write_page(page: Path = PAGE) -> None:
         """Return how many campaigns at 1.25 d* were validated, and after how many executions."""
         of = lines(1.25, looked_for, *names)
         after = f" (after {median(validated(of), 'executions'):g} executions in the median)" if validated(of) else ""
-        return f"{len(validated(of))} of {len(of)}{after}"
+        return f"{len(validated(of))} of {len(of)}{after}" if of else "not run"
 
     below = lines(0.95, True, *SYSTEMS)
     page.write_text(
