@@ -202,10 +202,11 @@ def _evidence(certificate: Certificate, tau: float, quantities: Quantities) -> s
     text += "."
     if (pushes := tolerances(certificate, tau)) is not None:
         everywhere, away = pushes
+        error = "error of M beside dry friction" if details.get("friction") else "error of M"
         text += (
             " No tried task exceeds the threshold under a further error of M, beyond what was learned, of up to "
             f"{_push(everywhere)} at every step, or of {_push(away)} where no record is near; the largest recorded "
-            f"error of M is {_rate(everywhere.state, everywhere.residual)}."
+            f"{error} is {_rate(everywhere.state, everywhere.residual)}."
         )
     if (pocket := details.get("pocket")) is not None:
         text += (
