@@ -8,7 +8,7 @@ import numpy as np
 
 from ctxval import Experiment, Task, TaskSpace, controllers, distances, models, systems
 from ctxval._util.arrays import Array
-from dynamics_systems import experiment
+from dynamics_systems import experiment, repeated
 from strangers import row
 
 GRAVITY = 9.81
@@ -29,12 +29,10 @@ def mechanism(push: Push, dt: float, substeps: int = 1) -> models.Function:
     def step(x: Array, u: Array) -> Array:
         k = x.shape[-1] // 2
         places, speeds = x[..., :k], x[..., k:]
-        for _ in range(substeps):
-            speeds = speeds + dt / substeps * push(places, speeds, u)
-            places = places + dt / substeps * speeds
-        return np.concatenate([places, speeds], axis=-1)
+        speeds = speeds + dt / substeps * push(places, speeds, u)
+        return np.concatenate([places + dt / substeps * speeds, speeds], axis=-1)
 
-    return models.Function(step, vectorized=True)
+    return models.Function(repeated(step, substeps), vectorized=True)
 
 
 def coulomb(speed: Array, slow: float = 0.002) -> Array:
@@ -52,9 +50,7 @@ def pair(
         names = space.names
         first = [getattr(p, each) for each in names if each.startswith("start")]
         last = [getattr(p, each) for each in names if each.startswith("goal")]
-        states = len(Q)
-        first = first or [0.0 * each for each in last]
-        zeros = [0.0 * last[0]] * (states - len(last))
+        zeros = [0.0 * last[0]] * (len(Q) - len(last))
         return Task(row(*first, *zeros), goal=row(*last, *zeros), horizon=horizon, dt=dt)
 
     return experiment(
@@ -74,7 +70,7 @@ def geared_pendulum(load: float = 1.08, friction: float = 0.7) -> Push:
     return lambda q, w, u: (u - 0.15 * w - load * 0.08 * GRAVITY * np.sin(q) - friction * coulomb(w)) / load
 
 
-def ball_screw(rest: float = 0.25, friction: float = 0.4) -> Push:
+def ball_screw(rest: float, friction: float) -> Push:
     """An axis whose friction is larger at rest than in motion (Stribeck)."""
     return lambda q, w, u: u - 0.5 * w - (friction + rest * np.exp(-((w / 0.05) ** 2))) * coulomb(w)
 
@@ -119,12 +115,12 @@ def scara(load: float = 0.55, friction: tuple[float, float] = (0.5, 0.2)) -> Pus
     return push
 
 
-def worn_guide(worn: float = 1.2, friction: float = 0.4) -> Push:
+def worn_guide(worn: float, friction: float) -> Push:
     """An axis whose friction is three times as large in 6 % of its range."""
     return lambda q, w, u: u - 0.5 * w - np.where((q > 0.5) & (q < 0.74), worn, friction) * coulomb(w)
 
 
-def loaded_gear(share: float = 0.15, friction: float = 0.2) -> Push:
+def loaded_gear(share: float, friction: float) -> Push:
     """An axis whose friction grows with the torque that it transmits."""
     return lambda q, w, u: u - 0.5 * w - (friction + share * np.abs(u)) * coulomb(w)
 
@@ -160,15 +156,18 @@ def _moves(unit: str, start: float, goal: float, *, of: str = "") -> dict[str, t
     return {f"start{of}": (-start, start, unit), f"goal{of}": (-goal, goal, unit)}
 
 
+def axis(name: str, push: Callable[[float, float], Push], *sizes: float) -> Experiment:
+    """Return the experiment of an axis whose friction has two sizes; they are 0 in M."""
+    space = TaskSpace(**_moves("m", 1.0, 2.0))
+    return pair(name, "m", space, push(*sizes), push(0.0, 0.0), 60, 0.04, [10.0, 1.0], 0.5, (0,))
+
+
 SYSTEMS: dict[str, Callable[[], Experiment]] = {
     "geared-pendulum": lambda: pair(
         "geared-pendulum", "rad", TaskSpace(**_moves("rad", 1.0, 1.2)),
         geared_pendulum(), geared_pendulum(1.0, 0.0), 60, 0.03, [30.0, 3.0], 0.2, (0,),
     ),
-    "ball-screw": lambda: pair(
-        "ball-screw", "m", TaskSpace(**_moves("m", 1.0, 2.0)),
-        ball_screw(), ball_screw(0.0, 0.0), 60, 0.04, [10.0, 1.0], 0.5, (0,),
-    ),
+    "ball-screw": lambda: axis("ball-screw", ball_screw, 0.25, 0.4),
     "cart-pole": lambda: pair(
         "cart-pole", "m", TaskSpace(**_moves("m", 0.5, 1.0)),
         cart_pole(), cart_pole(0.0), 100, 0.03, [20.0, 20.0, 5.0, 2.0], 0.5, (0,),
@@ -182,12 +181,6 @@ SYSTEMS: dict[str, Callable[[], Experiment]] = {
         scara(), scara(0.5, (0.0, 0.0)), 60, 0.03, [30.0, 30.0, 2.0, 2.0], 0.2, (0, 1), 2,
     ),
     "frictionloss-arm": frictionloss_arm,
-    "worn-guide": lambda: pair(
-        "worn-guide", "m", TaskSpace(**_moves("m", 1.0, 2.0)),
-        worn_guide(), worn_guide(0.0, 0.0), 60, 0.04, [10.0, 1.0], 0.5, (0,),
-    ),
-    "loaded-gear": lambda: pair(
-        "loaded-gear", "m", TaskSpace(**_moves("m", 1.0, 2.0)),
-        loaded_gear(), loaded_gear(0.0, 0.0), 60, 0.04, [10.0, 1.0], 0.5, (0,),
-    ),
+    "worn-guide": lambda: axis("worn-guide", worn_guide, 1.2, 0.4),
+    "loaded-gear": lambda: axis("loaded-gear", loaded_gear, 0.15, 0.2),
 }  # fmt: skip

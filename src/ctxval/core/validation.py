@@ -162,14 +162,15 @@ class Validation:
     def plan(self, point: ArrayLike) -> Plan:
         """Design the controller for the task at ``(d,)`` and run it on the model; S is not executed."""
         parameters = self.space.parameters(point)
-        where = self.space.describe_point(parameters.points)
         try:
             plan = self.plan_of(parameters, self.task_at(parameters))
         except (DesignError, ModelError) as error:
+            where = self.space.describe_point(parameters.points)
             raise type(error)(f"{str(error).removesuffix('.')} (task {where}).") from error
         if plan.task.batch_shape:
             raise ShapeError(f"the task function made a batch of shape {plan.task.batch_shape} of one point.")
         if not plan.model_trajectory.finite:
+            where = self.space.describe_point(parameters.points)
             ended = f"the model's closed loop {plan.model_trajectory.ended} for the task {where}"
             raise ModelError(f"{ended}: repair the model, or restrict the task space to tasks that it can perform.")
         return plan

@@ -115,11 +115,11 @@ class DynamicsDraws(DrawsWithoutNoise):
             if isinstance(self.model, DryFriction):
                 following = self.model.following(x, acting, lambda inputs: self._residuals(x, inputs))
             else:
-                following = self.model.step(x, acting) + self._residuals(x, u)
+                following = self.model.step(x, acting) + self._residuals(x, acting)
             return following.reshape(shape)
 
     def _residuals(self, x: Array, u: Array) -> Array:
-        """Return the residuals at pairs ``(S, q, n), (S, q, m)``."""
+        """Return the residuals ``(S, q, n)`` at states ``(S, q, n)`` and acting inputs ``(S, q, m)``."""
         z = bounded(self.data.standardised(x, u))
         parts = np.split(z, np.cumsum([len(each.weights) for each in self.expansions[:-1]], dtype=int))
         learned = np.concatenate([each(part) for each, part in zip(self.expansions, parts, strict=True)])

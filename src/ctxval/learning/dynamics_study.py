@@ -27,7 +27,7 @@ from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import STRUCTURES, WITHOUT_LAGS, NoiseStudy
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
-from ctxval.learning.recorded import data_near, digest, recorded_transitions, scheduled
+from ctxval.learning.recorded import data_near, digest, recorded_transitions, schedule, scheduled
 from ctxval.learning.regular import split_transitions
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
@@ -257,15 +257,14 @@ class DynamicsStudy(ShortRepr):
     def _found_actuator(self, executed: Executed, learned: LearnedDynamics) -> Actuator | None:
         """Return a delay and a lag of inputs that explain the errors of predictions; one that is found is refined."""
         actuator = None
-        counts = range(_FEWEST_AGAINST, len(executed) + 1) if self.actuator is None else ()
-        for some in (executed[:count] for count in counts if scheduled(count) == count):
+        counts = schedule(_FEWEST_AGAINST, len(executed)) if self.actuator is None else ()
+        for some in (executed[:count] for count in counts):
             key = digest(trajectory for _, trajectory in some)
             if key not in self._actuators:
                 self._actuators[key] = None  # also if its search fails
                 known: LearnedDynamics | None = learned
                 if actuator is None and len(some) < len(executed):
-                    extended = self.extended.executions(some)
-                    known = None if extended is None else self._learn(extended, (), with_data=True)
+                    known = self._learned_alone(some, with_data=True)
                 # Left-out error below which nobody asks whether inputs act late.
                 if actuator is not None or (known is not None and known.left_out_error > 0.02):
                     self._actuators[key] = self._search_actuator(some, actuator)
@@ -304,43 +303,44 @@ class DynamicsStudy(ShortRepr):
         if self.friction is not None or self.given.outputs is not None:
             return None
         study: DynamicsStudy | None = None
-        for some in (executed[:count] for count in range(_FEWEST_HELD, len(executed) + 1) if scheduled(count) == count):
+        for some in (executed[:count] for count in schedule(_FEWEST_HELD, len(executed))):
             key = digest(trajectory for _, trajectory in some)
             if key not in self._slowed:
                 self._slowed[key] = study  # also if its search fails
-                extended = self.extended.executions(some)
-                known = (
-                    learned if len(some) == len(executed) else extended and self._learn(extended, (), with_data=True)
-                )
-                if extended and known and (study is not None or known.left_out_error > _WELL):
-                    recorded = self._recorded(extended, (), with_data=False)
-                    with single_threaded(), np.errstate(all="ignore"):
-                        model = before_refinement(self.validation.model)
-                        friction = None if recorded is None else found_friction(model, recorded[0])
-                    if friction is not None:
-                        tried = DynamicsStudy(self.given, self.seed, self.quantile, self.extended, friction)
-                        if study is not None or _error_of_rates(tried.learn(some), known) < _HALF:
-                            self._slowed[key] = tried
+                without = learned if len(some) == len(executed) else self._learned_alone(some, with_data=True)
+                if without is not None and (study is not None or without.left_out_error > _WELL):
+                    tried = self._friction_study(some)
+                    if tried and (study is not None or _error_of_rates(tried.learn(some), without) < _HALF):
+                        self._slowed[key] = tried
             study = self._slowed[key]
         held = None if study is None else study.learn(executed)
         return held if _error_of_rates(held, learned) < _KEPT else None
 
+    def _friction_study(self, executed: Executed) -> DynamicsStudy | None:
+        """Return a study of M with the dry friction that executions show; None if they show none."""
+        extended, model = self.extended.executions(executed), before_refinement(self.validation.model)
+        recorded = self._recorded(extended, (), with_data=False) if extended else None
+        with single_threaded(), np.errstate(all="ignore"):
+            friction = None if recorded is None else found_friction(model, recorded[0])
+        if friction is None:
+            return None
+        return DynamicsStudy(self.given, self.seed, self.quantile, self.extended, friction)
+
     def _most_telling(self, executed: Executed) -> tuple[str | None, float, float]:
         """Return the task parameter with which predictions err least, and the left-out errors with it and without."""
-        name, least = None, np.inf
+        name, least = None, np.inf  # the data that M was made from tell no parameters
         for other in self.given.space.units:
             if other not in self.given.physical:
                 study = self._with_parameter(other)
-                learned = study._learned_alone(executed)
+                learned = study._learned_alone(executed, with_data=False)
                 if learned is not None and learned.left_out_error < least:
                     name, least = other, learned.left_out_error
-        without_it = self._learned_alone(executed)
+        without_it = self._learned_alone(executed, with_data=False)
         return name, least, 0.0 if without_it is None else without_it.left_out_error
 
-    def _learned_alone(self, executed: Executed) -> LearnedDynamics | None:
-        # The data that M was made from tell no parameters.
+    def _learned_alone(self, executed: Executed, *, with_data: bool) -> LearnedDynamics | None:
         extended = self.extended.executions(executed)
-        return None if extended is None else self._learn(extended, (), with_data=False)
+        return None if extended is None else self._learn(extended, (), with_data=with_data)
 
     def suspected_parameter(self, learned: LearnedDynamics) -> tuple[str, float] | None:
         """Return the task parameter that the dynamics depend on most clearly, and how many times less predictions err.

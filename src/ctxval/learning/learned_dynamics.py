@@ -200,9 +200,10 @@ class LearnedDynamics(ShortRepr):
     @property
     def friction(self) -> dict[str, float]:
         """The largest dry friction at the inputs that have some, by their labels."""
-        of_inputs, friction = self.labels[-self.posterior.data.inputs :], self.study.friction
-        sizes = [] if friction is None else friction.largest.tolist()
-        return {label: size for label, size in zip(of_inputs, sizes, strict=False) if size}
+        if self.study.friction is None:
+            return {}
+        of_inputs, sizes = self.labels[-self.posterior.data.inputs :], self.study.friction.largest.tolist()
+        return {label: size for label, size in zip(of_inputs, sizes, strict=True) if size}
 
     @functools.cached_property
     def positions(self) -> list[list[int]]:

@@ -92,6 +92,11 @@ def digest(runs: Iterable[Trajectory | Record]) -> bytes:
     return hashlib.sha256(b"".join(part.tobytes() for run in runs for part in (run.states, run.inputs))).digest()
 
 
+def schedule(fewest: int, count: int) -> list[int]:
+    """Return the numbers from ``fewest`` to ``count`` at which :func:`scheduled` changes."""
+    return [each for each in range(fewest, count + 1) if scheduled(each) == each]
+
+
 def scheduled(count: int) -> int:
     """Return the largest of 0 to 4, 6, 8, 12, 16, 24 and so on, two in each doubling, that is not above ``count``."""
     step = 1

@@ -50,20 +50,21 @@ class ResidualData:
 
 def residual_data(model: Model, transitions: Transitions, sources: Rows) -> ResidualData | None:
     """Return the residuals of a model; None if fewer than two transitions are usable, or if M explains all of them."""
-    recorded, of = np.concatenate([transitions.x, transitions.u], axis=1), sources
+    recorded, moving = np.concatenate([transitions.x, transitions.u], axis=1), np.ones(len(transitions), dtype=np.bool_)
     if isinstance(model, DryFriction):
-        acting, moving = model.acting(transitions)
-        model, transitions, sources = model.model, acting[moving], sources[moving]
+        transitions, moving = model.acting(transitions)
+        model = model.model
     with np.errstate(all="ignore"):
         residuals = transitions.x_next - model.step(transitions.x, transitions.u)
         steps = transitions.x_next - transitions.x
     pairs = np.concatenate([transitions.x, transitions.u], axis=1)
     # Larger numbers have diverged, and their squares would not be finite.
     usable = (np.abs(np.concatenate([pairs, residuals, steps], axis=1)) < 1e100).all(axis=1)
-    if usable.sum() < 2:
+    teach = usable & moving
+    if teach.sum() < 2:
         return None
-    pairs, residuals = pairs[usable], residuals[usable]
-    typical = standard_deviations(steps[usable])
+    pairs, residuals = pairs[teach], residuals[teach]
+    typical = standard_deviations(steps[teach])
     sizes = np.sqrt((residuals**2).mean(axis=0))
     learned = sizes > NEGLIGIBLE * typical
     if not learned.any():
@@ -72,7 +73,7 @@ def residual_data(model: Model, transitions: Transitions, sources: Rows) -> Resi
     return ResidualData(
         (pairs - shift) / scale,
         residuals / np.where(learned, sizes, np.inf),
-        sources[usable],
+        sources[teach],
         shift,
         scale,
         sizes,
@@ -80,9 +81,9 @@ def residual_data(model: Model, transitions: Transitions, sources: Rows) -> Resi
         learned,
         units=np.where(learned, sizes, 0.0),
         inputs=transitions.u.shape[1],
-        transitions=transitions[usable],
-        recorded=(recorded - shift)[(np.abs(recorded) < 1e100).all(axis=1)] / scale,
-        executed=of[(np.abs(recorded) < 1e100).all(axis=1)] >= 0,
+        transitions=transitions[teach],
+        recorded=(recorded[usable] - shift) / scale,
+        executed=sources[usable] >= 0,
     )
 
 

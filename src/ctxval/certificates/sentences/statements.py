@@ -230,11 +230,11 @@ def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
             "noise is independent from step to step, like that of the records, and the dynamics do not change with "
             f"time or with the task{but}"
         )
-    acting = late(evidence.actuator)
+    acting, friction = late(evidence.actuator), rubbing(evidence.friction)
     return (
         complete,
         *([f"inputs act alike in every task: {acting.removeprefix('acting ')}"] if acting else []),
-        *([f"{friction} is the same everywhere"] if (friction := rubbing(evidence.friction)) else []),
+        *([f"{friction} is the same everywhere"] if friction else []),
         alike,
         f"{prior}; its hyperparameters are unknown and integrated over",
         *(_WITHOUT_DATA if evidence.without_data else ()),
@@ -287,11 +287,11 @@ def conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
             complete = f"{'' if estimated else 'the '}{state_of(estimated)} being complete"
         noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
         alike = f"the system being deterministic{noise}, and its dynamics {changing}"
-    acting = late(details["actuator"])
+    acting, friction = late(details["actuator"]), rubbing(details["friction"])
     return [
         complete,
         *([f"the inputs {acting} in every task, as in the executions"] if acting else []),
-        *([f"{friction} being the same everywhere"] if (friction := rubbing(details["friction"])) else []),
+        *([f"{friction} being the same everywhere"] if friction else []),
         alike,
         "its dynamics in the gaps of the records being like those beside the gaps (at most "
         f"{with_units(details['resolution'])} wide in single coordinates, wider in several at once)",
