@@ -5,10 +5,11 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
+import numpy as np
 import pytest
 
 from conftest import make_validation
-from ctxval import Experiment, distances, systems
+from ctxval import Experiment, Task, TaskSpace, distances, systems
 from ctxval.core.experiment import UnitsWarning
 
 LABELS = ("angle [rad]", "rate [rad/s]")
@@ -58,3 +59,20 @@ def test_without_different_units_there_is_no_warning(labels: tuple[str, ...]) ->
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Experiment("x", make_validation(), states=labels)
+
+
+def _swing(convert: float) -> Any:
+    space = TaskSpace(lean=(-30, 30, "deg"), goal=(-1, 1, "rad"))
+    return make_validation().with_parts(
+        space=space, task=lambda p: Task([convert * p.lean, 0], goal=[-p.goal, 0], horizon=3, dt=0.1)
+    )
+
+
+def test_a_parameter_that_is_taken_as_a_state_in_another_unit_is_warned_of() -> None:
+    distance = distances.FinalState(components=[0])
+    message = "the parameter lean in deg as the initial angle in rad, and does not convert it"
+    with pytest.warns(UnitsWarning, match=message):
+        Experiment("x", _swing(1.0).with_parts(distance=distance), states=LABELS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Experiment("x", _swing(np.pi / 180).with_parts(distance=distance), states=LABELS)

@@ -85,13 +85,15 @@ def test_a_step_is_that_of_mujoco_in_any_batch() -> None:
 
 
 def test_a_state_that_is_not_finite_or_at_which_mujoco_warns_has_no_next_state(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warnings into the working directory
+    monkeypatch.chdir(tmp_path)
     model = models.MuJoCo(mjcf(0.0), dt=DT)
     states = np.array([[0.1, 0.0], [np.nan, 0.0], [0.0, 1e12]])
     reached = model.step(states, np.zeros((3, 1)))
     assert np.isfinite(reached).all(axis=1).tolist() == [True, False, False]
+    # MuJoCo prints no warning, and logs none into the working directory.
+    assert (*capfd.readouterr(), *tmp_path.iterdir()) == ("", "")
 
 
 @pytest.mark.thorough

@@ -93,7 +93,9 @@ def require(name: str, annotation: Any, value: Any) -> Any:
         raise UnknownNameError.among(name, value, get_args(annotation))
     wanted = _missed(annotation, value)
     if wanted:
-        raise InputError(f"{name} must be {wanted}, got {_SHOWN.repr(value)}.")
+        part = getattr(value, name, None)  # that of an experiment, for example
+        meant = "" if part is None or _missed(annotation, part) else f": give its .{name}"
+        raise InputError(f"{name} must be {wanted}, got {_SHOWN.repr(value)}{meant}.")
     return value
 
 

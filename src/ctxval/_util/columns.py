@@ -60,6 +60,12 @@ def conversion(recorded: str, wanted: str) -> float:
     return source[0] / target[0]
 
 
+def differ(first: str, second: str) -> bool:
+    """Return whether two units are known, and not the same."""
+    known = _parsed(first), _parsed(second)
+    return None not in known and known[0] != known[1]
+
+
 def named_unit(column: str) -> tuple[str, str, bool]:
     """Return the name and the unit of a column, and whether the unit is weak: ``x_m`` may be a measured x."""
     if len(column) > 200:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,19 @@ def compile_mjcf(mjcf: str | Path) -> tuple[str, Any]:
         digest = _digest(str(mjcf).encode(), Path()) if is_text else _digest(read_bytes(mjcf), Path(mjcf).parent)
     with reworded("MuJoCo cannot compile the model", ValueError):
         return digest, loader.from_xml_string(str(mjcf)) if is_text else loader.from_xml_path(str(mjcf))
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Let MuJoCo print no warnings, and write none to a file ``MUJOCO_LOG.TXT``, while its caller counts them."""
+    import mujoco
+
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda text: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def warning_of(counts: Any) -> str:

@@ -5,8 +5,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
 
 from ctxval._util.checked import PositiveFloat, PositiveInt, checked
+from ctxval._util.columns import differ
 from ctxval._util.representation import call, lines
 from ctxval._util.texts import parted
 from ctxval.core.labels import Labels, names_of
@@ -15,7 +19,7 @@ from ctxval.core.validation import Validation
 
 
 class UnitsWarning(UserWarning):
-    """A distance without weights or scales adds states of different units, or of another unit than its own."""
+    """Numbers of different units are added, compared or taken for each other."""
 
 
 @checked
@@ -24,7 +28,7 @@ class Experiment:
     """A validation with its defaults, as ``ctxval run`` runs it; it gets the names and units as its labels.
 
     A UnitsWarning says that the distance, without weights and scales, adds states of different units, or of another
-    unit than its own.
+    unit than its own, or that the task function takes a parameter as a state of another unit.
     """
 
     name: str  #: a short name for files and displays
@@ -44,7 +48,7 @@ class Experiment:
             object.__setattr__(self, name, getattr(labels, name))
         if labels != given:
             object.__setattr__(self, "validation", self.validation.with_parts(labels=labels))
-        if (doubt := self.doubt_of_units) is not None:
+        for doubt in filter(None, (self.doubt_of_units, self.doubt_of_parameters)):
             warnings.warn(doubt, UnitsWarning, stacklevel=3)
 
     @property
@@ -67,6 +71,32 @@ class Experiment:
                 f"the distance is in {added[0]}, as its states are, and not in {self.units}: no unit is converted, so "
                 f"state units={added[0]!r} and a threshold in {added[0]}, or give scales."
             )
+        return None
+
+    @property
+    def doubt_of_parameters(self) -> str | None:
+        """Why a task parameter is taken as a state without a conversion of its unit; None if all is well.
+
+        Their numbers are compared in some random tasks, so a task function that converts the unit gives no doubt.
+        """
+        space = self.validation.space
+        try:
+            points = space.iid(4, np.random.default_rng(0))
+            tasks = [self.validation.task_at(space.parameters(point)) for point in points]
+            states = list(self.names(tasks[0].initial_state.shape[-1], 0)[0].items())
+            taken = {"initial": [task.initial_state for task in tasks], "goal": [task.goal for task in tasks]}
+            for (what, values), (column, label) in product(taken.items(), enumerate(space.labels)):
+                parameter, unit = parted(label)
+                equal = np.abs(np.stack(values)) == np.abs(points[:, column, None])
+                for row in np.flatnonzero(equal.all(axis=0) & (np.ptp(points[:, column]) > 0)):
+                    state, wanted = states[row]
+                    if unit and wanted and differ(unit, wanted):
+                        return (
+                            f"the task function takes the parameter {parameter} in {unit} as the {what} {state} in "
+                            f"{wanted}, and does not convert it: convert it there, or state its range in {wanted}."
+                        )
+        except Exception:  # parts that do not fit together are refused where they are used
+            return None
         return None
 
     def names(self, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:

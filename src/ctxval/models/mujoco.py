@@ -11,7 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
 from ctxval._util.checked import Seconds
-from ctxval._util.mjcf import compile_mjcf, is_mjcf_text
+from ctxval._util.mjcf import compile_mjcf, is_mjcf_text, quiet
 from ctxval._util.refusals import require_extra
 from ctxval._util.registry import part
 from ctxval.core.model import paired
@@ -85,14 +85,15 @@ class MuJoCo:
         reached = np.full(states.shape, np.nan)
         mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo need")
         data = mujoco.MjData(model)
-        for k in np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1)).tolist():
-            mujoco.mj_resetData(model, data)
-            data.qpos, data.qvel, data.ctrl = states[k, :nq], states[k, nq:], inputs[k]
-            if self._forces is not None:
-                data.qfrc_applied = self._forces
-            mujoco.mj_step(model, data, self.substeps)
-            if not data.warning.number.any():
-                reached[k] = np.concatenate([data.qpos, data.qvel])
+        with quiet():
+            for k in np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1)).tolist():
+                mujoco.mj_resetData(model, data)
+                data.qpos, data.qvel, data.ctrl = states[k, :nq], states[k, nq:], inputs[k]
+                if self._forces is not None:
+                    data.qfrc_applied = self._forces
+                mujoco.mj_step(model, data, self.substeps)
+                if not data.warning.number.any():
+                    reached[k] = np.concatenate([data.qpos, data.qvel])
         return reached.reshape(*batch, -1)
 
 

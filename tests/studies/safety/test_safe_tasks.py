@@ -95,6 +95,12 @@ def test_a_margin_is_falsified_by_a_counterexample_or_certified(margin: float, a
         assert found.d_b_bound == margin
 
 
+def test_what_is_missing_for_a_margin_names_the_command_of_specifications() -> None:
+    found = assess(Campaign(validation(0.65), seed=0).run(4, 0.65, explore=False, progress=False), tasks=200)
+    assert found.answer == "undecided"
+    assert "(`ctxval safe` executes" in found.statement
+
+
 @pytest.mark.slow
 def test_without_any_violation_in_sight_nothing_is_certified_and_it_says_why() -> None:
     given = validation()

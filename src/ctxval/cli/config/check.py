@@ -156,6 +156,8 @@ def _names(experiment: Experiment, counts: Mapping[str, int]) -> Findings:
         bare = [name for name, unit in named.items() if not unit]
         missing = f"; no unit for {', '.join(bare)}" if bare else ""
         yield "noted" if bare else "ok", f"{kind}: {', '.join(labels_of(named)) or 'none'}{missing}"
+    if (doubt := experiment.doubt_of_parameters) is not None:
+        yield "noted", doubt.removesuffix(".")
     if not experiment.units:
         yield "noted", "the distance has no units"
 

@@ -222,6 +222,11 @@ def _compared(
     return compared, float(deviation(model, system, task)), float(moved)
 
 
+def _executed_here(reason: str) -> str:
+    """Return a reason that names the command that executes tasks of a specification."""
+    return reason.replace("`ctxval run`", "`ctxval safe`")
+
+
 def _bound(
     campaign: Campaign, margin: float | None, options: CertificateOptions
 ) -> tuple[Verdict | None, Certificate | None, float | None, str | None]:
@@ -234,15 +239,17 @@ def _bound(
         )
     if margin is not None:
         verdict = campaign.verdict(margin, certificate=options)
+        verdict = replace(verdict, reason=_executed_here(verdict.reason))
         if verdict.answer == "validated":
             return verdict, verdict.certificate, margin, None
         return verdict, verdict.certificate, None, untested or verdict.reason.removesuffix(".")
     try:
         certified = campaign.certify(certificate=options)
     except CertificateError as error:
-        return None, None, None, untested or str(error).removesuffix(".")
+        return None, None, None, untested or _executed_here(str(error)).removesuffix(".")
     if certified.bound is None:
-        return None, certified, None, untested or certified.doubt or "the certificate leaves out a share of the tasks"
+        doubt = certified.doubt or "the certificate leaves out a share of the tasks"
+        return None, certified, None, untested or _executed_here(doubt)
     # Share of a bound on d_b by which a search may end below its largest value, which lies on a ridge: in the
     # study of ``docs/how-to/safety.md``, it ended by up to 0.2 % below.
     searched = max(certified.details.get("disagreement") or 0.0, 0.01)
