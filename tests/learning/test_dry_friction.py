@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,21 +18,27 @@ from ctxval.learning import DynamicsStudy
 from ctxval.learning.dry_friction import DryFriction, found_friction
 from rig_thorough import more
 
-H, DT, GRIP = 40, 0.05, 0.8
+H, DT, GRIP, SLOW = 40, 0.05, 0.8, 0.1
 MASS = np.array([[2.0, 0.6], [0.6, 1.0]])
 MODEL = models.Linear(np.array([[1.0, DT], [0.0, 1.0]]), np.array([[0.0], [DT]]))
 JOINTS = models.Linear(np.eye(2), DT * np.linalg.inv(MASS))  # rates of two joints on which torques act
 
 
-def sticky_step(x: Array, u: Array, grip: float = GRIP) -> Array:
+def sticky_step(x: Array, u: Array, grip: float = GRIP, excess: float = 0.0) -> Array:
     """A cart with drag and dry friction, of 40 short steps, so that it may stop within a step."""
     position, speed = x[..., 0], x[..., 1]
     dt = DT / 40
     for _ in range(40):
         free = speed + dt * (u[..., 0] - 0.3 * speed)
-        speed = np.sign(free) * np.maximum(np.abs(free) - dt * grip, 0.0)
+        most = grip + excess * np.exp(-((speed / SLOW) ** 2))
+        speed = np.sign(free) * np.maximum(np.abs(free) - dt * most, 0.0)
         position = position + dt * speed
     return np.stack([position, speed], axis=-1)
+
+
+def rubbing(model: models.Linear, rates: list[int], sliding: Array) -> DryFriction:
+    m = len(rates)
+    return DryFriction(model, np.array(rates), sliding, np.zeros(m), np.ones(m), np.zeros(m), np.full(m, 1e-3))
 
 
 def recorded(step: Any, count: int = 300, inputs: int = 1) -> Transitions:
@@ -43,7 +50,7 @@ def recorded(step: Any, count: int = 300, inputs: int = 1) -> Transitions:
 
 @given(st.floats(-3, 3), st.floats(-3, 3), st.floats(0, 4))
 def test_friction_slows_a_rate_and_never_turns_it(speed: float, push: float, grip: float) -> None:
-    held = DryFriction(MODEL, np.array([1]), np.array([grip]), np.zeros(1), np.array([1e-3]))
+    held = rubbing(MODEL, [1], np.array([grip]))
     free = speed + DT * push
     after = held.step(np.array([0.0, speed]), np.array([push]))[1]
     assert after == pytest.approx(np.sign(free) * max(abs(free) - DT * grip, 0.0), abs=1e-9)
@@ -52,7 +59,7 @@ def test_friction_slows_a_rate_and_never_turns_it(speed: float, push: float, gri
 @given(st.lists(st.floats(-3, 3), min_size=4, max_size=4), st.floats(0, 5), st.floats(0, 5))
 def test_coupled_frictions_are_those_of_the_quadratic_program(values: list[float], first: float, second: float) -> None:
     rates, torques, largest = np.array(values[:2]), np.array(values[2:]), np.array([first, second]) + 1e-6
-    held = DryFriction(JOINTS, np.array([0, 1]), largest, np.zeros(2), np.array([1e-3, 1e-3]))
+    held = rubbing(JOINTS, [0, 1], largest)
     root = np.linalg.cholesky(DT * np.linalg.inv(MASS))
     solved = lsq_linear(root.T, np.linalg.solve(root, JOINTS.step(rates, torques)), (-largest, largest), tol=1e-14)
     expected = JOINTS.step(rates, torques - solved.x)
@@ -63,7 +70,26 @@ def test_its_size_is_found_beside_another_error_of_the_model() -> None:
     friction = found_friction(MODEL, recorded(sticky_step))
     assert friction is not None
     assert friction.rates.tolist() == [1]
-    assert friction.largest[0] == pytest.approx(GRIP, rel=0.02)
+    assert friction.sliding[0] == pytest.approx(GRIP, rel=0.02)
+
+
+def test_its_size_is_in_units_of_the_input_if_the_model_errs_in_what_an_input_does() -> None:
+    weak = models.Linear(MODEL.A, 0.8 * MODEL.B)
+    friction = found_friction(weak, recorded(sticky_step))
+    assert friction is not None
+    assert friction.sliding[0] == pytest.approx(GRIP, rel=0.02)
+
+
+@pytest.mark.parametrize("excess", [0.0, 0.4])
+def test_friction_that_is_larger_at_rest_is_found_to_be_so(excess: float) -> None:
+    friction = found_friction(MODEL, recorded(partial(sticky_step, excess=excess), 2000))
+    assert friction is not None
+    assert friction.sliding[0] == pytest.approx(GRIP, rel=0.02)
+    assert friction.excess[0] == pytest.approx(excess, rel=0.15)
+    if excess:
+        assert friction.slow[0] == pytest.approx(SLOW, rel=0.3)
+        x, u = np.zeros((2, 2)), np.array([[GRIP + 0.25], [GRIP + 0.6]])  # the first one is held, the second one is not
+        np.testing.assert_allclose(friction.step(x, u), sticky_step(x, u, excess=excess), rtol=0, atol=0.01)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +118,7 @@ def test_a_joint_that_creeps_while_it_is_held_is_found_to_do_so() -> None:
     x, u = np.concatenate([moving, resting]), np.concatenate([2 * rng.normal(size=200), rng.uniform(-0.7, 0.7, 100)])
     friction = found_friction(MODEL, Transitions(x, u[:, None], creeping(x, u[:, None])))
     assert friction is not None
-    assert friction.largest[0] == pytest.approx(GRIP, rel=0.02)
+    assert friction.sliding[0] == pytest.approx(GRIP, rel=0.02)
     assert friction.creep[0] == pytest.approx(0.004, rel=0.1)
     np.testing.assert_allclose(friction.step(resting, u[200:, None]), creeping(resting, u[200:, None]), atol=4e-4)
 

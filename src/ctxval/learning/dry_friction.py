@@ -3,17 +3,19 @@
 Its force changes by a jump where a joint stops or turns, so it is no smooth function of state and input, and few
 recorded runs do not teach it to a Gaussian process. Here it is a part of the inputs, as in the time stepping of Moreau
 (1988): the inputs ``u - f`` act, with ``|f_j| <= c_j``, where f_j brings the rate that input j drives to rest if it
-can, and opposes it as strongly as it can otherwise. What M misses is a smooth function of the state and the inputs that
-act. It is learned of steps in which all these rates move, because f is known there.
+can, and opposes it as strongly as it can otherwise. The limit c_j may be larger at rest than in motion (Stribeck 1902).
+What M misses is a smooth function of the state and the inputs that act. It is learned of steps in which all these rates
+move, because f is known there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import nnls
+from scipy.special import erf
 
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.model import Model
@@ -25,15 +27,19 @@ _SWEEPS = 4  # each time, of the inputs, whose frictions act on each other's rat
 _EXPLAINED = 0.7  # share of the squared residuals, beside a linear function, that must be left at most
 _REST = 0.05  # share of the root mean square of a rate below which the joint is at rest
 _PER_COEFFICIENT = 5  # fewest recorded steps for each coefficient of the linear function
+_SLOW = np.geomspace(_REST, 0.5, 15)  # rates up to which friction is larger, as shares like _REST
+_LARGER = 0.5  # share of the squared residuals that must be left at most if friction is larger at rest
 
 
 @dataclass(frozen=True, eq=False)
 class DryFriction:
-    """M with dry friction of constant size at its inputs."""
+    """M with dry friction at its inputs."""
 
     model: Model
     rates: Rows  # the state that each input drives (m,)
-    largest: Array  # the largest friction at each input, in its units (m,)
+    sliding: Array  # the largest friction at each input if its joint moves fast, in its units (m,)
+    excess: Array  # by how much larger it is at rest (m,)
+    slow: Array  # the rate at which the excess has fallen to 37 % (m,)
     creep: Array  # the rate at which a held joint creeps under a unit of its input (m,)
     change: Array  # by which inputs are changed to see what they do (m,)
 
@@ -46,26 +52,37 @@ class DryFriction:
         reached, effects = _reached(self.model, x, u, self.change)
         force, residuals = np.zeros_like(u), np.zeros_like(reached)
         for _ in range(_TIMES):  # what is missed depends on the force, which it changes little
-            force = self._force(reached + residuals, effects, force)
+            force = self._force(x, reached + residuals, effects, force)
             residuals = missed(u - force)
-        force = self._force(reached + residuals, effects, force)
+        force = self._force(x, reached + residuals, effects, force)
         return np.asarray(reached + residuals - (effects * force[..., None, :]).sum(axis=-1))
 
-    def _force(self, reached: Array, effects: Array, force: Array) -> Array:
+    def _force(self, x: Array, reached: Array, effects: Array, force: Array) -> Array:
         """Return the friction ``(..., m)`` that holds joints, but for their creep, if it can, from a first guess."""
         m, of_rates, force = len(self.rates), effects[..., self.rates, :], force.copy()
+        before = x[..., self.rates]
+        at_first = self._limits(before, before)
         with np.errstate(all="ignore"):  # states of draws that diverge
             for j in [*range(m)] * (_SWEEPS if m > 1 else 1):  # projected Gauss-Seidel
-                own = of_rates[..., j, j]
+                own, limit = of_rates[..., j, j], at_first[..., j]
                 rate = reached[..., self.rates[j]] - (of_rates[..., j, :] * force).sum(axis=-1)
-                holding = (rate + own * force[..., j]) / (own + np.sign(own) * self.creep[j])
-                force[..., j] = np.clip(np.nan_to_num(holding), -self.largest[j], self.largest[j])
+                free = rate + own * force[..., j]
+                holding = np.nan_to_num(free / (own + np.sign(own) * self.creep[j]))
+                slipping = free - own * np.clip(holding, -limit, limit)
+                less = self._limits(before, slipping[..., None])[..., j]  # once it slips
+                limit = np.where(np.abs(holding) <= limit, limit, less)
+                force[..., j] = np.clip(holding, -limit, limit)
         return force
+
+    def _limits(self, before: Array, after: Array) -> Array:
+        """Return the largest friction in steps between these rates; shapes ``(..., m)``."""
+        return self.sliding + self.excess * _slowness(before, after, self.slow)
 
     def acting(self, transitions: Transitions) -> tuple[Transitions, Mask]:
         """Return transitions with the inputs that act, and of which the friction is known ``(N,)``: all joints move."""
         directions = _directions(transitions, self.rates)
-        acting = transitions.u - self.largest * directions
+        limits = self._limits(transitions.x[:, self.rates], transitions.x_next[:, self.rates])
+        acting = transitions.u - limits * directions
         return Transitions(transitions.x, acting, transitions.x_next), (directions != 0).all(axis=1)
 
 
@@ -86,23 +103,50 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
     features = np.column_stack([np.ones(len(x)), x / standard_deviations(x), u / ranges])[moving]
     if len(set(rates.tolist())) < len(rates) or len(features) < _PER_COEFFICIENT * features.shape[1]:
         return None
-    residuals = (transitions.x_next - reached)[moving][:, rates]
-    of_friction = -(effects[:, rates] * directions[:, None, :])[moving]  # (N, m, m): of each rate, by each input
+    residuals, of_rates = (transitions.x_next - reached)[moving][:, rates], effects[moving][:, rates]
     sizes = np.sqrt((residuals**2).mean(axis=0))
-    if not (np.isfinite(of_friction).all() and np.isfinite(sizes).all() and (sizes > 0).all()):
+    if not (np.isfinite(of_rates).all() and np.isfinite(sizes).all() and (sizes > 0).all()):
         return None
-    linear = np.linalg.qr(features)[0]
+    m, linear = len(rates), np.linalg.qr(features)[0]
+    usual = np.sqrt((transitions.x_next[:, rates] ** 2).mean(axis=0))
+    before, after = x[moving][:, rates], transitions.x_next[moving][:, rates]
 
     def beside_linear(values: Array) -> Array:
         flat = values.reshape(len(values), -1)
         return (flat - linear @ (linear.T @ flat)).reshape(values.shape)
 
     left = beside_linear(residuals / sizes)
-    explained = beside_linear(of_friction / sizes[:, None])
-    largest, rest = nnls(explained.reshape(-1, len(rates)), left.ravel())
+
+    def fitted(shapes: Sequence[Array]) -> tuple[float, Array]:
+        """Return what is left if friction has some shapes ``(N, m)``, each with a size at each input ``(shapes, m)``."""
+        acting = of_rates  # the change of each rate by a unit of each input (N, m, m)
+        for _ in range(3):
+            forces = np.concatenate([-acting * shape[:, None, :] for shape in shapes], axis=2)
+            largest, rest = nnls(beside_linear(forces / sizes[:, None]).reshape(-1, forces.shape[2]), left.ravel())
+            # The linear function is one of the inputs that act, so it changes what friction does.
+            slopes = np.linalg.lstsq(features, residuals - forces @ largest)[0][-m:] / ranges[:, None]
+            acting = of_rates + slopes.T
+        return float(rest), largest.reshape(len(shapes), m)
+
+    moves = directions[moving]
+    rest, (sliding, *_) = fitted([moves])
     if not rest**2 < _EXPLAINED * (left**2).sum():
         return None
-    return DryFriction(model, rates, largest, _creep(transitions, reached, effects, rates), 1e-3 * ranges)
+    excess, slow = np.zeros(m), _REST
+    larger = {slow: fitted([moves, moves * _slowness(before, after, slow * usual)]) for slow in _SLOW.tolist()}
+    best = min(larger, key=lambda each: larger[each][0])
+    if larger[best][0] ** 2 < _LARGER * rest**2:
+        slow, (sliding, excess) = best, larger[best][1]
+    creep = _creep(transitions, reached, effects, rates)
+    return DryFriction(model, rates, sliding, excess, slow * usual, creep, 1e-3 * ranges)
+
+
+def _slowness(before: Array, after: Array, slow: Array) -> Array:
+    """Return the mean of ``exp(-(rate / slow)^2)`` over steps in which rates change evenly; all shapes ``(..., m)``."""
+    first, last = before / slow, after / slow
+    same = np.abs(last - first) < 1e-4
+    mean = 0.5 * np.sqrt(np.pi) * (erf(last) - erf(first)) / np.where(same, 1.0, last - first)
+    return np.where(same, np.exp(-(first**2)), mean)
 
 
 def _creep(transitions: Transitions, reached: Array, effects: Array, rates: Rows) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import ShortRepr
+from ctxval._util.texts import parted
 from ctxval.core.coverage import StateInputCoverage, StatePocket, UntriedParameter
 from ctxval.core.labels import labels_of
 from ctxval.core.learned_numbers import PushedDistances
@@ -199,11 +200,15 @@ class LearnedDynamics(ShortRepr):
 
     @property
     def friction(self) -> dict[str, float]:
-        """The largest dry friction at the inputs that have some, by their labels."""
-        if self.study.friction is None:
-            return {}
-        of_inputs, sizes = self.labels[-self.posterior.data.inputs :], self.study.friction.largest.tolist()
-        return {label: size for label, size in zip(of_inputs, sizes, strict=True) if size}
+        """The dry friction at the inputs that have some, by their labels, and that at rest if it is larger."""
+        friction, sizes = self.study.friction, dict[str, float]()
+        if friction is not None:
+            of_inputs = self.labels[-self.posterior.data.inputs :]
+            for label, sliding, excess in zip(of_inputs, friction.sliding, friction.excess, strict=True):
+                name, unit = parted(label)
+                at_rest = labels_of({f"{name} at rest": unit})[0]
+                sizes |= {label: float(sliding), at_rest: float(sliding + excess) if excess else 0.0}
+        return {label: size for label, size in sizes.items() if size}
 
     @functools.cached_property
     def positions(self) -> list[list[int]]:

@@ -296,7 +296,8 @@ def _causes(residual: ResidualShare) -> Iterator[str]:
         yield (
             f"no cause explains half of the residual of {residual.state}: state and input explain "
             f"{100 * residual.explained:.0f} % of it, and the step before {100 * residual.history:.0f} % of the rest; "
-            f"what is left, {left}, may be noise, or something that is not recorded"
+            f"what is left, {left}, may be noise, something that is not recorded, or a function that this check is too "
+            "coarse for"
         )
     if residual.history >= causes.EXPLAINS and residual.rest > 0.05 * residual.rms:
         yield (
