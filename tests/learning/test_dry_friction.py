@@ -24,13 +24,13 @@ MODEL = models.Linear(np.array([[1.0, DT], [0.0, 1.0]]), np.array([[0.0], [DT]])
 JOINTS = models.Linear(np.eye(2), DT * np.linalg.inv(MASS))  # rates of two joints on which torques act
 
 
-def sticky_step(x: Array, u: Array, grip: float = GRIP, excess: float = 0.0) -> Array:
+def sticky_step(x: Array, u: Array, grip: float = GRIP, excess: float = 0.0, load: float = 0.0) -> Array:
     """A cart with drag and dry friction, of 40 short steps, so that it may stop within a step."""
     position, speed = x[..., 0], x[..., 1]
     dt = DT / 40
     for _ in range(40):
         free = speed + dt * (u[..., 0] - 0.3 * speed)
-        most = grip + excess * np.exp(-((speed / SLOW) ** 2))
+        most = grip + load * np.abs(u[..., 0]) + excess * np.exp(-((speed / SLOW) ** 2))
         speed = np.sign(free) * np.maximum(np.abs(free) - dt * most, 0.0)
         position = position + dt * speed
     return np.stack([position, speed], axis=-1)
@@ -38,7 +38,7 @@ def sticky_step(x: Array, u: Array, grip: float = GRIP, excess: float = 0.0) -> 
 
 def rubbing(model: models.Linear, rates: list[int], sliding: Array) -> DryFriction:
     m = len(rates)
-    return DryFriction(model, np.array(rates), sliding, np.zeros(m), np.ones(m), np.zeros(m), np.full(m, 1e-3))
+    return DryFriction(model, np.array(rates), sliding, *np.zeros((2, m)), np.ones(m), np.zeros(m), np.full(m, 1e-3))
 
 
 def recorded(step: Any, count: int = 300, inputs: int = 1) -> Transitions:
@@ -90,6 +90,14 @@ def test_friction_that_is_larger_at_rest_is_found_to_be_so(excess: float) -> Non
         assert friction.slow[0] == pytest.approx(SLOW, rel=0.3)
         x, u = np.zeros((2, 2)), np.array([[GRIP + 0.25], [GRIP + 0.6]])  # the first one is held, the second one is not
         np.testing.assert_allclose(friction.step(x, u), sticky_step(x, u, excess=excess), rtol=0, atol=0.01)
+
+
+def test_friction_that_grows_with_the_input_is_found_to_do_so() -> None:
+    friction = found_friction(MODEL, recorded(partial(sticky_step, load=0.2)))
+    assert friction is not None
+    assert friction.sliding[0] == pytest.approx(GRIP, rel=0.05)
+    assert friction.load[0] == pytest.approx(0.2, rel=0.05)
+    assert friction.excess[0] == 0.0
 
 
 @pytest.mark.parametrize(

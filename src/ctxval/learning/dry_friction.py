@@ -3,7 +3,8 @@
 Its force changes by a jump where a joint stops or turns, so it is no smooth function of state and input, and few
 recorded runs do not teach it to a Gaussian process. Here it is a part of the inputs, as in the time stepping of Moreau
 (1988): the inputs ``u - f`` act, with ``|f_j| <= c_j``, where f_j brings the rate that input j drives to rest if it
-can, and opposes it as strongly as it can otherwise. The limit c_j may be larger at rest than in motion (Stribeck 1902).
+can, and opposes it as strongly as it can otherwise. The limit c_j may grow with the input, as that of a gear does, and
+may be larger at rest than in motion (Stribeck 1902).
 What M misses is a smooth function of the state and the inputs that act. It is learned of steps in which all these rates
 move, because f is known there.
 """
@@ -28,7 +29,7 @@ _EXPLAINED = 0.7  # share of the squared residuals, beside a linear function, th
 _REST = 0.05  # share of the root mean square of a rate below which the joint is at rest
 _PER_COEFFICIENT = 5  # fewest recorded steps for each coefficient of the linear function
 _SLOW = np.geomspace(_REST, 0.5, 15)  # rates up to which friction is larger, as shares like _REST
-_LARGER = 0.5  # share of the squared residuals that must be left at most if friction is larger at rest
+_LARGER = 0.5  # share of the squared residuals that must be left at most if friction has one more shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,8 @@ class DryFriction:
 
     model: Model
     rates: Rows  # the state that each input drives (m,)
-    sliding: Array  # the largest friction at each input if its joint moves fast, in its units (m,)
+    sliding: Array  # the largest friction at each input if its joint moves fast and no input acts, in its units (m,)
+    load: Array  # by how much larger it is for a unit of the input (m,)
     excess: Array  # by how much larger it is at rest (m,)
     slow: Array  # the rate at which the excess has fallen to 37 % (m,)
     creep: Array  # the rate at which a held joint creeps under a unit of its input (m,)
@@ -52,16 +54,16 @@ class DryFriction:
         reached, effects = _reached(self.model, x, u, self.change)
         force, residuals = np.zeros_like(u), np.zeros_like(reached)
         for _ in range(_TIMES):  # what is missed depends on the force, which it changes little
-            force = self._force(x, reached + residuals, effects, force)
+            force = self._force(x, u, reached + residuals, effects, force)
             residuals = missed(u - force)
-        force = self._force(x, reached + residuals, effects, force)
+        force = self._force(x, u, reached + residuals, effects, force)
         return np.asarray(reached + residuals - (effects * force[..., None, :]).sum(axis=-1))
 
-    def _force(self, x: Array, reached: Array, effects: Array, force: Array) -> Array:
+    def _force(self, x: Array, u: Array, reached: Array, effects: Array, force: Array) -> Array:
         """Return the friction ``(..., m)`` that holds joints, but for their creep, if it can, from a first guess."""
         m, of_rates, force = len(self.rates), effects[..., self.rates, :], force.copy()
         before = x[..., self.rates]
-        at_first = self._limits(before, before)
+        at_first = self._limits(u, before, before)
         with np.errstate(all="ignore"):  # states of draws that diverge
             for j in [*range(m)] * (_SWEEPS if m > 1 else 1):  # projected Gauss-Seidel
                 own, limit = of_rates[..., j, j], at_first[..., j]
@@ -69,19 +71,19 @@ class DryFriction:
                 free = rate + own * force[..., j]
                 holding = np.nan_to_num(free / (own + np.sign(own) * self.creep[j]))
                 slipping = free - own * np.clip(holding, -limit, limit)
-                less = self._limits(before, slipping[..., None])[..., j]  # once it slips
+                less = self._limits(u, before, slipping[..., None])[..., j]  # once it slips
                 limit = np.where(np.abs(holding) <= limit, limit, less)
                 force[..., j] = np.clip(holding, -limit, limit)
         return force
 
-    def _limits(self, before: Array, after: Array) -> Array:
-        """Return the largest friction in steps between these rates; shapes ``(..., m)``."""
-        return self.sliding + self.excess * _slowness(before, after, self.slow)
+    def _limits(self, u: Array, before: Array, after: Array) -> Array:
+        """Return the largest friction in steps with these inputs and between these rates; shapes ``(..., m)``."""
+        return self.sliding + self.load * np.abs(u) + self.excess * _slowness(before, after, self.slow)
 
     def acting(self, transitions: Transitions) -> tuple[Transitions, Mask]:
         """Return transitions with the inputs that act, and of which the friction is known ``(N,)``: all joints move."""
         directions = _directions(transitions, self.rates)
-        limits = self._limits(transitions.x[:, self.rates], transitions.x_next[:, self.rates])
+        limits = self._limits(transitions.u, transitions.x[:, self.rates], transitions.x_next[:, self.rates])
         acting = transitions.u - limits * directions
         return Transitions(transitions.x, acting, transitions.x_next), (directions != 0).all(axis=1)
 
@@ -118,7 +120,7 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
     left = beside_linear(residuals / sizes)
 
     def fitted(shapes: Sequence[Array]) -> tuple[float, Array]:
-        """Return what is left if friction has some shapes ``(N, m)``, each with a size at each input ``(shapes, m)``."""
+        """Return what is left if friction has some shapes ``(N, m)``, and the sizes of each at each input."""
         acting = of_rates  # the change of each rate by a unit of each input (N, m, m)
         for _ in range(3):
             forces = np.concatenate([-acting * shape[:, None, :] for shape in shapes], axis=2)
@@ -129,16 +131,21 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
         return float(rest), largest.reshape(len(shapes), m)
 
     moves = directions[moving]
-    rest, (sliding, *_) = fitted([moves])
+    rest, largest = fitted([moves])
     if not rest**2 < _EXPLAINED * (left**2).sum():
         return None
-    excess, slow = np.zeros(m), _REST
-    larger = {slow: fitted([moves, moves * _slowness(before, after, slow * usual)]) for slow in _SLOW.tolist()}
-    best = min(larger, key=lambda each: larger[each][0])
-    if larger[best][0] ** 2 < _LARGER * rest**2:
-        slow, (sliding, excess) = best, larger[best][1]
+    shapes = [moves, moves * np.abs(u[moving])]
+    loaded, by_load = fitted(shapes)
+    if grows := loaded**2 < _LARGER * rest**2:
+        rest, largest = loaded, by_load
+    shapes = shapes if grows else [moves]
+    slowed = {slow: fitted([*shapes, moves * _slowness(before, after, slow * usual)]) for slow in _SLOW.tolist()}
+    slow = min(slowed, key=lambda each: slowed[each][0])
+    if falls := slowed[slow][0] ** 2 < _LARGER * rest**2:
+        largest = slowed[slow][1]
+    load, excess = largest[1] if grows else np.zeros(m), largest[-1] if falls else np.zeros(m)
     creep = _creep(transitions, reached, effects, rates)
-    return DryFriction(model, rates, sliding, excess, slow * usual, creep, 1e-3 * ranges)
+    return DryFriction(model, rates, largest[0], load, excess, slow * usual, creep, 1e-3 * ranges)
 
 
 def _slowness(before: Array, after: Array, slow: Array) -> Array:

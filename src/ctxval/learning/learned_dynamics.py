@@ -200,14 +200,18 @@ class LearnedDynamics(ShortRepr):
 
     @property
     def friction(self) -> dict[str, float]:
-        """The dry friction at the inputs that have some, by their labels, and that at rest if it is larger."""
+        """The dry friction at the inputs that have some, by their labels.
+
+        If it is larger at rest, or grows with the input, it is followed by that at rest, or by its share of the input.
+        """
         friction, sizes = self.study.friction, dict[str, float]()
         if friction is not None:
-            of_inputs = self.labels[-self.posterior.data.inputs :]
-            for label, sliding, excess in zip(of_inputs, friction.sliding, friction.excess, strict=True):
+            for j, label in enumerate(self.labels[-self.posterior.data.inputs :]):
                 name, unit = parted(label)
-                at_rest = labels_of({f"{name} at rest": unit})[0]
-                sizes |= {label: float(sliding), at_rest: float(sliding + excess) if excess else 0.0}
+                at_rest, share = *labels_of({f"{name} at rest": unit}), f"share of {name}"
+                excess = friction.excess[j]
+                known = (friction.sliding[j], friction.sliding[j] + excess if excess else 0.0, friction.load[j])
+                sizes |= dict(zip((label, at_rest, share), map(float, known), strict=True))
         return {label: size for label, size in sizes.items() if size}
 
     @functools.cached_property
