@@ -12,12 +12,12 @@ from dynamics_systems import experiment, repeated
 from strangers import row
 
 GRAVITY = 9.81
-DEVELOPMENT = ("geared-pendulum", "ball-screw", "frictionloss-arm")
+DEVELOPMENT = ("geared-pendulum", "ball-screw", "loaded-gear", "frictionloss-arm")
 """Systems that the method was developed on."""
-REGULAR = ("cart-pole", "gantry", "scara")
-"""Others whose friction is of constant size."""
-OTHERS = ("worn-guide", "loaded-gear")
-"""Others whose friction changes with the place or the load."""
+REGULAR = ("cart-pole", "gantry", "scara", "harmonic-drive", "xy-table")
+"""Others whose friction is of a kind that is learned."""
+OTHERS = ("worn-guide", "two-way-ratchet")
+"""Others whose friction changes with the place or the direction."""
 
 Push = Callable[[Array, Array, Array], Array]
 """The accelerations ``(..., k)`` at positions, speeds and inputs."""
@@ -115,6 +115,27 @@ def scara(load: float = 0.55, friction: tuple[float, float] = (0.5, 0.2)) -> Pus
     return push
 
 
+def harmonic_drive(load: float = 1.2, sliding: float = 0.4, share: float = 0.1, excess: float = 0.3) -> Push:
+    """A link on a gear whose friction grows with the torque and is larger at rest; the link of M is lighter."""
+
+    def push(q: Array, w: Array, u: Array) -> Array:
+        grip = sliding + share * np.abs(u) + excess * np.exp(-((w / 0.1) ** 2))
+        return (u - 0.2 * w - 0.1 * GRAVITY * load * np.sin(q) - grip * coulomb(w)) / load
+
+    return push
+
+
+def xy_table(heavy: float = 1.6, sizes: tuple[float, float, float] = (0.5, 0.3, 0.2)) -> Push:
+    """Two axes, of which the lower one carries the other; their frictions are larger at rest. M takes it for lighter."""
+    mass, grips = np.array([heavy, 0.9]), np.array(sizes[:2])
+    return lambda q, w, u: (u - 0.6 * w - (grips + sizes[2] * np.exp(-((w / 0.08) ** 2))) * coulomb(w)) / mass
+
+
+def two_way_ratchet(forward: float, back: float) -> Push:
+    """An axis whose friction is larger in one direction."""
+    return lambda q, w, u: u - 0.5 * w - np.where(w > 0, forward, back) * coulomb(w)
+
+
 def worn_guide(worn: float, friction: float) -> Push:
     """An axis whose friction is three times as large in 6 % of its range."""
     return lambda q, w, u: u - 0.5 * w - np.where((q > 0.5) & (q < 0.74), worn, friction) * coulomb(w)
@@ -180,7 +201,16 @@ SYSTEMS: dict[str, Callable[[], Experiment]] = {
         "scara", "rad", TaskSpace(**_moves("rad", 1.0, 1.2, of="_1"), **_moves("rad", 1.0, 1.2, of="_2")),
         scara(), scara(0.5, (0.0, 0.0)), 60, 0.03, [30.0, 30.0, 2.0, 2.0], 0.2, (0, 1), 2,
     ),
+    "harmonic-drive": lambda: pair(
+        "harmonic-drive", "rad", TaskSpace(**_moves("rad", 0.8, 1.4)),
+        harmonic_drive(), harmonic_drive(1.1, 0.0, 0.0, 0.0), 60, 0.04, [40.0, 4.0], 0.2, (0,),
+    ),
+    "xy-table": lambda: pair(
+        "xy-table", "m", TaskSpace(**_moves("m", 0.5, 1.0, of="_x"), **_moves("m", 0.5, 1.0, of="_y")),
+        xy_table(), xy_table(1.5, (0.0, 0.0, 0.0)), 60, 0.04, [20.0, 20.0, 2.0, 2.0], 0.2, (0, 1), 2,
+    ),
     "frictionloss-arm": frictionloss_arm,
     "worn-guide": lambda: axis("worn-guide", worn_guide, 1.2, 0.4),
     "loaded-gear": lambda: axis("loaded-gear", loaded_gear, 0.15, 0.2),
+    "two-way-ratchet": lambda: axis("two-way-ratchet", two_way_ratchet, 0.7, 0.4),
 }  # fmt: skip
