@@ -16,6 +16,7 @@ from ctxval.certificates.dynamics_diagnostics import (
     AGREE,
     BEYOND,
     CORNER,
+    DIVERGED,
     FEWEST,
     GAP,
     JUMP,
@@ -56,6 +57,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
         {"coverage": replace(COVERED, beyond=gap(2 * BEYOND))},
         "leave the recorded range of u[0] by 4 % (at x[0] 1, u[0] 3)",
     ),
+    ({"coverage": replace(COVERED, beyond=gap(2 * DIVERGED))}, "predicted runs diverge"),
     ({"coverage": replace(COVERED, marginal=gap(1.1 * GAP))}, "enter a gap in the records of u[0] by 28 %"),
     (
         {"coverage": replace(COVERED, pair=gap(1.1 * PAIR_GAP, "x[0]", "u[0]"))},

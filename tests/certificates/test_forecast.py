@@ -79,3 +79,5 @@ def test_a_forecast_speaks_in_words() -> None:
         "at least 1 more execution is needed to validate it, and 95 % of the posterior samples"
     )
     assert str(fewest).endswith("stay below the threshold")
+    above = "the learned dynamics expect a distance above the threshold: 2 % of the posterior samples of the dynamics"
+    assert str(Forecast(8, 0.02, 0.98, fewest=True)).startswith(above)

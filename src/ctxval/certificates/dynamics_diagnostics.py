@@ -41,6 +41,7 @@ SHARP = 0.05  # share by which a large predicted distance may exceed the median 
 JUMP = 0.01  # jump of the predicted distance between nearly equal tasks, as a share of the bound
 DENSE = 2  # task parameters in which deeper searches may find the largest distance in spite of jumps
 NOISY_FEWEST = 5  # executions for a bound if the system is noisy
+DIVERGED = 10.0  # share of the visited range from which on predicted runs are said to diverge
 NOISY_BEYOND = 0.06  # the same as BEYOND: noise leads a little beyond what a few executions have recorded
 NOISY_TESTED = 0.75  # the same as TESTED, of the median posterior sample, which has the noise of all executions
 TOLERATED = 0.02  # share of the bound by which a distance may exceed its prediction without being an excess
@@ -235,7 +236,8 @@ def uncovered(evidence: DynamicsEvidence) -> list[str]:
 
     coverage, pair, missing = evidence.coverage, evidence.coverage.pair, []
     if coverage.beyond.size > most_beyond(evidence):
-        missing.append(sentences.BEYOND.format(gap=at(coverage.beyond)))
+        far = coverage.beyond.size > DIVERGED
+        missing.append(sentences.DIVERGED if far else sentences.BEYOND.format(gap=at(coverage.beyond)))
     if coverage.marginal.size > GAP:
         missing.append(sentences.GAP.format(gap=at(coverage.marginal)))
     if pair is not None and pair.size > PAIR_GAP:

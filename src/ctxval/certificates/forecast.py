@@ -29,6 +29,8 @@ class Forecast:
         plural = "execution is" if self.executions == 1 else "executions are"
         if self.fewest:
             share = f"{100 * self.validated:.0f} % of the posterior samples of the dynamics stay below the threshold"
+            if self.validated < 0.05:
+                return f"the learned dynamics expect a distance above the threshold: {share}"
             return f"at least {self.executions} more {plural} needed to validate it, and {share}"
         many = f"about {self.executions}" if self.executions is not None else f"more than {HORIZON}"
         shares = {"validated": self.validated, "falsified": self.falsified}

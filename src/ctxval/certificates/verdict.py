@@ -146,7 +146,8 @@ def judge(
     parts = [verdict.reason.removesuffix("."), verdict.expected, designs_sentence(trials)]
     bets = bets_against(trials, float(threshold), quantile)
     if verdict.answer != "falsified" and bets is not None and bets.above:
-        parts.append(sentences.noise_may_explain(bets, float(threshold), known.quantities, chosen.confidence))
+        above = sentences.noise_may_explain(bets, float(threshold), known.quantities, chosen.confidence)
+        parts.insert(0 if verdict.answer == "undecided" else len(parts), above)
     reason = "; ".join(str(part) for part in parts if part is not None)
     return replace(verdict, reason=f"{reason}.{sentences.caution(known, threshold)}")
 

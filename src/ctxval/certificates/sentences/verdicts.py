@@ -179,7 +179,7 @@ def rests_on(
     draws += [counted(tests["independent"], "independent draw")] if tests["independent"] else []
     return (
         f"{text} Without these assumptions, the tests alone show with {percent(certificate.confidence)} confidence "
-        f"that at most {at_most(100 * tests['share_missed'], 2)} % {of_tasks(certificate.distribution)} exceed "
+        f"only that at most {at_most(100 * tests['share_missed'], 2)} % {of_tasks(certificate.distribution)} exceed "
         f"{known.quantities.of(f'{tau:.6g}')} ({' and '.join(draws)})."
     )
 
@@ -202,11 +202,11 @@ def _evidence(certificate: Certificate, tau: float, quantities: Quantities) -> s
     text += "."
     if (pushes := tolerances(certificate, tau)) is not None:
         everywhere, away = pushes
-        error = "error of M beside dry friction" if details.get("friction") else "error of M"
+        beside = " beside dry friction" if details.get("friction") else ""
         text += (
             " No tried task exceeds the threshold under a further error of M, beyond what was learned, of up to "
-            f"{_push(everywhere)} at every step, or of {_push(away)} where no record is near; the largest recorded "
-            f"{error} is {_rate(everywhere.state, everywhere.residual)}."
+            f"{_push(everywhere)} at every step, or of {_push(away)} where no record is near; the largest error of M"
+            f"{beside} in the records, which was learned, is {_rate(everywhere.state, everywhere.residual)}."
         )
     if (pocket := details.get("pocket")) is not None:
         text += (

@@ -34,6 +34,10 @@ LEFT_OUT = (
     "largest posterior variance, and at most {most:g} % is allowed; more executions reduce it"
 )
 BEYOND = "predicted runs leave the recorded range of {gap}"
+DIVERGED = (
+    "predicted runs diverge: they leave the recorded range of states and inputs by more than ten times its width, so "
+    "too little is learned to predict them; begin with smaller tasks, and be ready to stop the system"
+)
 GAP = "predicted runs enter a gap in the records of {gap}"
 PAIR_GAP = "predicted runs enter a gap in the joint records of {gap}"
 GAP_AT = "{coordinates} by {percent:.2g} % (at {place}); `ctxval run` executes a task that goes there"
