@@ -126,7 +126,7 @@ def harmonic_drive(load: float = 1.2, sliding: float = 0.4, share: float = 0.1, 
 
 
 def xy_table(heavy: float = 1.6, sizes: tuple[float, float, float] = (0.5, 0.3, 0.2)) -> Push:
-    """Two axes, of which the lower one carries the other; their frictions are larger at rest. M takes it for lighter."""
+    """Two axes, of which one carries the other; their frictions are larger at rest. In M, the first one is lighter."""
     mass, grips = np.array([heavy, 0.9]), np.array(sizes[:2])
     return lambda q, w, u: (u - 0.6 * w - (grips + sizes[2] * np.exp(-((w / 0.08) ** 2))) * coulomb(w)) / mass
 
