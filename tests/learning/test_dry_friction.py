@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -171,6 +172,18 @@ def test_runs_that_stop_short_are_predicted_from_few_executions(
     assert learned.noisy is None  # what friction does within a step is no history
     expected, distances_ = learned.expected(points[count:]), [run.distance for run in runs[count:]]
     np.testing.assert_allclose(expected, distances_, rtol=0, atol=0.05 * max(distances_))
+
+
+def test_friction_is_found_in_records_with_noise() -> None:
+    rng, validation = np.random.default_rng(0), cart()
+    points, executed = rng.random((8, 2)), []
+    for point in points:
+        loop = validation.outcome(validation.space.from_unit(point)).system_trajectory
+        assert loop is not None
+        executed.append((point, replace(loop, states=loop.states + 0.02 * rng.normal(size=loop.states.shape))))
+    learned = DynamicsStudy(validation, quantile=0.9).learn(executed)
+    assert learned is not None
+    assert learned.friction == {"u[0]": pytest.approx(GRIP, rel=0.1)}
 
 
 @pytest.mark.parametrize("seed", more(0, 1, 2))

@@ -39,6 +39,7 @@ _FEWEST_HELD = 4  # executions from which on dry friction is looked for
 _WELL = 0.1  # left-out error below which neither these data nor task parameters are asked about
 _CLEARLY = 3.0  # factor by which predictions must err less without these data, or with a parameter, and err little
 _HALF = 0.5  # share of the left-out error of rates that dry friction must leave at most
+_CLEAR = 0.8  # the same of its square from which on noise may hide which one is larger
 _KEPT = 2.0  # the same, of friction that was found before: single steps tell less of it than closed loops do
 _SLOW = 0.02  # seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores
 
@@ -385,10 +386,13 @@ class DynamicsStudy(ShortRepr):
 def _error_of_rates(held: LearnedDynamics | None, without: LearnedDynamics) -> float:
     """Return the left-out error of the rates that friction slows, as a share of that without it; infinity for None.
 
-    Where a joint stops within a step changes its position a little, which nothing predicts.
+    Noise is no part of these errors if they are clearly smaller with friction. Where a joint stops within a step changes
+    its position a little, which nothing predicts.
     """
     if held is None or held.study.friction is None:
         return np.inf
-    of_rates = [each.left_out_errors[held.study.friction.rates] for each in (held, without)]
-    with_it, without_it = (float(np.sqrt((each**2).sum())) for each in of_rates)
-    return with_it / max(without_it, 1e-300)
+    rates = held.study.friction.rates
+    noise = (held.posterior.deviations[rates] / np.maximum(held.model_errors[rates], 1e-300)) ** 2
+    with_it, without_it = (float((each.left_out_errors[rates] ** 2).sum()) for each in (held, without))
+    least = min(float(noise.sum()), with_it) if with_it < _CLEAR * without_it else 0.0
+    return float(np.sqrt((with_it - least) / max(without_it - least, 1e-300)))

@@ -15,6 +15,7 @@ from ctxval._util.texts import parted
 from ctxval.core.coverage import StateInputCoverage, StatePocket, UntriedParameter
 from ctxval.core.labels import labels_of
 from ctxval.core.learned_numbers import PushedDistances
+from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import AnyPosterior, distances_of, loop_pairs
 from ctxval.learning.coverage import (
@@ -101,16 +102,22 @@ class LearnedDynamics(ShortRepr):
     @functools.cached_property
     def left_out_errors(self) -> Array:
         """The same of each state ``(n,)``; 0 for those of which nothing is learned."""
-        learned = self.posterior.data.learned
-        without = self.posterior.means_without([[k] for k in range(len(self.executed))])
-        errors, of_model = list[Array](), list[Array]()
-        for k, loop in enumerate(self.trajectories_of_system):
-            for model, of in ((without[k], errors), (self.study.validation.model, of_model)):
-                of.append((model.step(loop.states[:-1], loop.inputs) - loop.states[1:])[:, learned])
-        scale = np.sqrt((np.concatenate(of_model) ** 2).mean(axis=0))
-        each = np.zeros(len(learned))
-        each[learned] = np.sqrt(((np.concatenate(errors) / np.maximum(scale, 1e-300)) ** 2).mean(axis=0))
-        return each
+        numbers = range(len(self.executed))
+        without = self.posterior.means_without([[k] for k in numbers])
+        errors = self._errors_of([without[k] for k in numbers]) / np.maximum(self.model_errors, 1e-300)
+        return np.where(self.posterior.data.learned, errors, 0.0)
+
+    @functools.cached_property
+    def model_errors(self) -> Array:
+        """The root mean squares of the errors of the next states that M predicts in the executions ``(n,)``."""
+        return self._errors_of([self.study.validation.model] * len(self.executed))
+
+    def _errors_of(self, models: Sequence[Model]) -> Array:
+        loops = self.trajectories_of_system
+        errors = [
+            m.step(loop.states[:-1], loop.inputs) - loop.states[1:] for m, loop in zip(models, loops, strict=True)
+        ]
+        return np.asarray(np.sqrt((np.concatenate(errors) ** 2).mean(axis=0)))
 
     @functools.cached_property
     def screened(self) -> WorstCase:
