@@ -80,6 +80,8 @@ class Experiment:
         Their numbers are compared in some random tasks, so a task function that converts the unit gives no doubt.
         """
         space = self.validation.space
+        if not any(parted(label)[1] for label in space.labels):
+            return None
         try:
             points = space.iid(4, np.random.default_rng(0))
             tasks = [self.validation.task_at(space.parameters(point)) for point in points]
