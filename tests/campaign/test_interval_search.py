@@ -27,7 +27,8 @@ from ctxval import (
     systems,
 )
 from ctxval.campaign.dynamics import NEAR, PREDICTION
-from ctxval.campaign.interval_search import IntervalSearch, NewTasks, next_task
+from ctxval.campaign.interval_search import IntervalSearch
+from ctxval.campaign.next_task import NewTasks, next_task
 from ctxval.certificates import (
     AnytimeAudit,
     Audit,

@@ -12,8 +12,8 @@ import pytest
 
 from ctxval import TaskSpace, TaskSuite
 from ctxval.certificates import CheckedPrediction, DynamicsEvidence
+from ctxval.certificates.drawn_distances import DrawnDistances
 from ctxval.certificates.envelope import (
-    DrawnDistances,
     Envelope,
     boundary_tasks,
     doubt_of_envelope,

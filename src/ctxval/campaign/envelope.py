@@ -17,10 +17,10 @@ from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import dynamics_diagnostics as diagnostics
 from ctxval.certificates.automatic import Automatic
+from ctxval.certificates.drawn_distances import DrawnDistances
 from ctxval.certificates.dynamics import Dynamics, draws_for
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.envelope import (
-    DrawnDistances,
     Envelope,
     boundary_tasks,
     doubt_of_envelope,

@@ -8,15 +8,16 @@ dynamics can be learned, if most predictions fail, or if it decides earlier, it 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Rows
+from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
+from ctxval.campaign.next_task import NewTasks, next_task
 from ctxval.campaign.proposals import Steadiness, spread_tests
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule, Verdict
@@ -36,11 +37,7 @@ from ctxval.certificates.dynamics_diagnostics import (
     only_a_failed_test,
     only_tests_missing,
     raised,
-    uncovered,
     unentered_pocket,
-    untested,
-    untried_corner,
-    untried_parameter,
 )
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import Posterior
@@ -350,74 +347,3 @@ def with_next_task(verdict: Verdict, recorder: TrialRecorder, options: Certifica
         task = f"(caution: its predicted run goes far beyond all others; be ready to stop it) {task}"
     reason = f"{verdict.reason.removesuffix('.')}; next task: {task}."
     return replace(verdict, reason=reason, next_task=space.describe_point(point))
-
-
-@dataclass(frozen=True, eq=False)
-class NewTasks:
-    """Tells which tasks may be executed beside known ones."""
-
-    near: float = NEAR  #: the largest change of each coordinate to a task that is no new one
-    steady: Callable[[Array], bool] = lambda point: True  #: whether the distance of a task is that of its neighbours
-    #: moves a new task ``(d,)``, given the known ones ``(n, d)``; None if tasks are not moved
-    spread: Callable[[Array, Array], Array] | None = None
-    seen: Rows | slice = field(default_factory=lambda: slice(None))  #: coordinates in which a moved task must be new
-
-    def first(self, tasks: Array, known: Array, farthest: Array) -> Array | None:
-        """Return the first of tasks ``(m, d)`` that may be executed, as it is moved; None if there is none."""
-
-        def is_new(point: Array, by: Rows | slice = slice(None)) -> bool:
-            others, task = known[:, by], point[by]
-            close = others[np.abs(others - task).max(axis=1) <= self.near]
-            # A start may jump between tasks, so the closed loop next to an executed task may lead elsewhere.
-            most = 2 if np.array_equal(point, farthest) else 1
-            return len(close) < most and not (close == task).all(axis=1).any()
-
-        for task in filter(is_new, tasks):
-            moved = task if self.spread is None else self.spread(task, known)
-            if (moved is task or is_new(task, self.seen)) and self.steady(moved):
-                return moved
-        return None
-
-
-def next_task(
-    evidence: DynamicsEvidence, known: Array, best: float, limit: float, confidence: float, new: NewTasks
-) -> Array | None:
-    """Return the task to execute next, a point ``(d,)``; None if all tasks lie next to executed ones.
-
-    These come first: a task whose predicted distance exceeds the limit; the task of the draw that sets the bound,
-    while the bound exceeds the limit; the task that leads farthest from the records, while they leave gaps; and
-    the task with the largest predicted distance, while no similar distance was executed or a deeper search found it.
-    Further tasks test the predictions, and if all of these are known, the task that is farthest from all others does.
-
-    The known tasks ``(n, d)`` are executed or open, ``best`` is the largest executed distance, and ``limit`` is what
-    the bound must not exceed.
-    """
-    order = np.argsort(evidence.maxima, kind="stable")
-    rank = evidence.rank(confidence)
-    highest = evidence.points[[*order[rank::-1], *order[:rank:-1]]]
-    farthest, largest = evidence.coverage.task[None], evidence.elites
-    exceeds = evidence.upper(confidence) > limit
-    if exceeds and len(known) % 3 == 2:  # every third execution leads farthest from the records in any case
-        candidates = [farthest, highest]
-    elif evidence.highest > limit:
-        candidates = [largest, highest, farthest]
-    elif exceeds:
-        candidates = [highest, farthest]
-    elif uncovered(evidence):
-        candidates = [farthest, highest, largest]
-        if evidence.untried is not None and untried_parameter(evidence) is not None:
-            candidates = [evidence.untried.task[None], *candidates]
-        elif evidence.corner is not None and untried_corner(evidence) is not None:
-            candidates = [evidence.corner.task[None], *candidates]
-        elif evidence.pocket is not None and unentered_pocket(evidence) is not None:
-            candidates = [np.array(evidence.pocket.tasks), *candidates]
-    elif evidence.missed > 1 or untested(evidence, best, limit):
-        candidates = [largest, highest, farthest]
-    else:
-        candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]
-
-    # Of random tasks, the one farthest from all known tasks comes first.
-    others = np.random.default_rng(len(known)).random((256, known.shape[1]))
-    away = np.abs(others[:, None] - known).max(axis=2).min(axis=1, initial=1.0)
-    candidates.append(others[np.argsort(-away, kind="stable")])
-    return new.first(np.concatenate(candidates), known, evidence.coverage.task)

@@ -386,7 +386,7 @@ class DynamicsStudy(ShortRepr):
 def _error_of_rates(held: LearnedDynamics | None, without: LearnedDynamics) -> float:
     """Return the left-out error of the rates that friction slows, as a share of that without it; infinity for None.
 
-    Noise is no part of these errors if they are clearly smaller with friction. Where a joint stops within a step changes
+    Noise is left out if errors are clearly smaller with friction. Where a joint stops within a step changes
     its position a little, which nothing predicts.
     """
     if held is None or held.study.friction is None:
