@@ -78,7 +78,8 @@ false.**
 {table}
 
 "Friction" is the median of what was found at each input, in its units; "CPU" the median of seconds, of the campaigns
-at 1.25 d\\*. Friction that changes with the place (worn-guide) or the direction (two-way-ratchet) is beyond the method.
+at 1.25 d\\*. Friction that is larger in one direction (two-way-ratchet) is friction of constant size and a constant push.
+Friction that changes with the place (worn-guide) is beyond the method.
 """
 
 
