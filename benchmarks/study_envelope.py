@@ -132,10 +132,11 @@ the share of all tasks that it trusts although their true distance is larger. Tr
 tasks, of noisy systems at {noisy_tasks} tasks by {repeats} executions each.
 [How to use an envelope](how-to/envelope.md) says what it is.
 
-**The median share found is {found:.0f} % over the systems, of which each counts once. The median of a system is at least
-80 % on {enough} of {systems} systems, of which {contacts} have contacts and {noisy} noise (the goal is 8, of which 2 have contacts and 2
-noise). In {above} of {count} campaigns, the falsely included volume is above 1 % (the goal is at most 5 % of 200
-campaigns); the largest is {largest:.1f} %. In {withdrawn} campaigns, no envelope was stated.**
+**The median share found is {found:.0f} % over the systems, of which each counts once. The median of a system is at
+least 80 % on {enough} of {systems} systems, of which {contacts} have contacts and {noisy} noise (the goal is 8, of
+which 2 have contacts and 2 noise). In {above} of {count} campaigns, the falsely included volume is above 1 % (the
+goal is at most 5 % of 200 campaigns); the largest is {largest:.1f} %. In {withdrawn} campaigns, no envelope was
+stated.**
 
 {table}
 

@@ -62,24 +62,24 @@ def study(system: str, share: float, seed: int, looked_for: bool) -> dict[str, A
 TEXT = """# Dry friction, measured
 
 `make friction` makes this page. M lacks dry friction, which stops a joint short of its goal: the residual jumps where
-the joint stops or turns, and is no smooth function of state and input. From four executions on, friction is looked for
-at each input. It may grow with the input and be larger at rest, and is used if it halves the errors of the rates of
-left-out executions ([what is computed](theory.md#dry-friction)). Campaigns of at most {budget} executions ran on
-{count} systems. The method was developed on four of them: a geared pendulum, a ball screw whose friction is larger at
-rest, an axis whose friction grows with the force, and an arm of MuJoCo with `frictionloss`. Nothing was tuned on the
-others. d* is the largest distance over {tasks:,} random tasks. (A first version, of which campaigns on all but the last
-three systems were seen, took friction for constant, and estimated it in the inputs of M.)
+the joint stops or turns, and is no smooth function of state and input. From four executions on, friction is looked
+for at each input. It may grow with the input and be larger at rest, and is used if it halves the errors of the rates
+of left-out executions, apart from noise ([what is computed](theory.md#dry-friction)). Campaigns of at most {budget}
+executions ran on {count} systems. The method was developed on four of them: a geared pendulum, a ball screw whose
+friction is larger at rest, an axis whose friction grows with the force, and an arm of MuJoCo with `frictionloss`.
+Nothing was tuned on the others. d* is the largest distance over {tasks:,} random tasks. (A first version, of which
+campaigns on all but the last three systems were seen, took friction for constant, and estimated it in the inputs of
+M. The campaigns below ran before quadratic drag was added to what friction is estimated beside.)
 
-**At 1.25 d\\*, {found} campaigns on the other systems with friction of a kind that is learned
-were validated; without looking for friction, {before}. On the systems of the development, these were {developed}
-and {developed_before}. At 0.95 d\\*, {false} of {below} campaigns on all systems were validated, which is
-false.**
+**At 1.25 d\\*, {found} campaigns on the other systems with friction of a kind that is learned were validated; without
+looking for friction, {before}. On the systems of the development, these were {developed} and {developed_before}. At
+0.95 d\\*, {false} of {below} campaigns on all systems were validated, which is false.**
 
 {table}
 
-"Friction" is the median of what was found at each input, in its units; "CPU" the median of seconds, of the campaigns
-at 1.25 d\\*. Friction that is larger in one direction (two-way-ratchet) is friction of constant size and a constant push.
-Friction that changes with the place (worn-guide) is beyond the method.
+"Friction" is the median of what was found at each input, in its units; "CPU" the median of seconds, of the
+campaigns at 1.25 d\\*. Friction that is larger in one direction (two-way-ratchet) is friction of constant size and
+a constant push. Friction that changes with the place (worn-guide) is beyond the method.
 """
 
 

@@ -220,7 +220,8 @@ def test_a_class_is_no_object_of_it() -> None:
 
 def test_an_object_that_has_the_part_is_refused_with_a_hint() -> None:
     class Case:
-        tau = 0.5
+        def __init__(self) -> None:
+            self.tau = 0.5
 
     with pytest.raises(InputError, match=r"tau must be a positive number, got .*: give its \.tau\.$"):
         require("tau", PositiveFloat, Case())

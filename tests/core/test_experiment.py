@@ -68,11 +68,10 @@ def _swing(convert: float) -> Any:
     )
 
 
-def test_a_parameter_that_is_taken_as_a_state_in_another_unit_is_warned_of() -> None:
+def test_a_parameter_that_is_taken_as_a_state_in_another_unit_is_doubted() -> None:
     distance = distances.FinalState(components=[0])
-    message = "the parameter lean in deg as the initial angle in rad, and does not convert it"
-    with pytest.warns(UnitsWarning, match=message):
-        Experiment("x", _swing(1.0).with_parts(distance=distance), states=LABELS)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        Experiment("x", _swing(np.pi / 180).with_parts(distance=distance), states=LABELS)
+    doubted = Experiment("x", _swing(1.0).with_parts(distance=distance), states=LABELS).doubt_of_parameters
+    assert doubted is not None
+    assert "the parameter lean in deg as the initial angle in rad, and does not convert it" in doubted
+    converted = Experiment("x", _swing(np.pi / 180).with_parts(distance=distance), states=LABELS)
+    assert converted.doubt_of_parameters is None

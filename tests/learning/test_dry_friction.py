@@ -93,6 +93,30 @@ def test_friction_that_is_larger_at_rest_is_found_to_be_so(excess: float) -> Non
         np.testing.assert_allclose(friction.step(x, u), sticky_step(x, u, excess=excess), rtol=0, atol=0.01)
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-4, 1e-3])
+def test_its_size_is_found_under_feedback_with_fixed_gains(noise: float) -> None:
+    rng, x, runs = np.random.default_rng(0), np.array([[1.5, 0.0], [-1.2, 0.5], [0.8, -1.0], [-2.0, 0.0]]), []
+    for _ in range(40):
+        u = -x @ np.array([[3.0], [2.6]])
+        runs.append((x, u, sticky_step(x, u)))
+        x = runs[-1][2]
+    states, inputs, reached = map(np.concatenate, zip(*runs, strict=True))
+    measured = [each + noise * rng.normal(size=each.shape) for each in (states, reached)]
+    friction = found_friction(MODEL, Transitions(measured[0], inputs, measured[1]))
+    assert friction is not None
+    assert friction.sliding[0] == pytest.approx(GRIP, rel=0.05)
+
+
+def test_smooth_drag_is_not_taken_for_friction_that_is_larger_at_rest() -> None:
+    def draggy(x: Array, u: Array) -> Array:
+        return sticky_step(x, u) - DT * 0.5 * np.stack([0 * x[..., 1], x[..., 1] * np.abs(x[..., 1])], axis=-1)
+
+    friction = found_friction(MODEL, recorded(draggy))
+    assert friction is not None
+    assert friction.sliding[0] == pytest.approx(GRIP, rel=0.05)
+    assert friction.excess[0] == 0.0
+
+
 def test_friction_that_grows_with_the_input_is_found_to_do_so() -> None:
     friction = found_friction(MODEL, recorded(partial(sticky_step, load=0.2)))
     assert friction is not None
@@ -180,7 +204,7 @@ def test_friction_is_found_in_records_with_noise() -> None:
     for point in points:
         loop = validation.outcome(validation.space.from_unit(point)).system_trajectory
         assert loop is not None
-        executed.append((point, replace(loop, states=loop.states + 0.02 * rng.normal(size=loop.states.shape))))
+        executed.append((point, replace(loop, states=loop.states + 0.01 * rng.normal(size=loop.states.shape))))
     learned = DynamicsStudy(validation, quantile=0.9).learn(executed)
     assert learned is not None
     assert learned.friction == {"u[0]": pytest.approx(GRIP, rel=0.1)}

@@ -93,7 +93,7 @@ def require(name: str, annotation: Any, value: Any) -> Any:
         raise UnknownNameError.among(name, value, get_args(annotation))
     wanted = _missed(annotation, value)
     if wanted:
-        part = getattr(value, name, None)  # that of an experiment, for example
+        part = getattr(value, "__dict__", {}).get(name)  # that of an experiment, for example
         meant = "" if part is None or _missed(annotation, part) else f": give its .{name}"
         raise InputError(f"{name} must be {wanted}, got {_SHOWN.repr(value)}{meant}.")
     return value

@@ -61,9 +61,9 @@ def conversion(recorded: str, wanted: str) -> float:
 
 
 def differ(first: str, second: str) -> bool:
-    """Return whether two units are known, and not the same."""
-    known = _parsed(first), _parsed(second)
-    return None not in known and known[0] != known[1]
+    """Return whether two units are different ones of the same quantity."""
+    source, target = _parsed(first), _parsed(second)
+    return source is not None and target is not None and source[1] == target[1] and source[0] != target[0]
 
 
 def named_unit(column: str) -> tuple[str, str, bool]:

@@ -20,7 +20,7 @@ from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.certificates import Certificate
 from ctxval.certificates.envelope import Envelope
 from ctxval.cli import base
-from ctxval.cli.base import NewStore, Parallel, command, err, named_values, out, print_table
+from ctxval.cli.base import NewStore, Parallel, command, err, named_values, notes, out, print_table
 from ctxval.cli.config.settings import ExperimentSettings, read_settings
 from ctxval.cli.config.stored_settings import Limits
 from ctxval.cli.stores import print_envelope
@@ -59,6 +59,8 @@ def run(
     settings = read_settings(target, {**vars(made), **vars(limits), **stated})
     settings = settings.certified_as({"resolution": resolution, "tests": tests, "quantile": quantile})
     experiment, certificate = settings.load(), settings.certificate_options
+    if (doubt := experiment.doubt_of_parameters) is not None:
+        notes.say(doubt)
     if truth and experiment.truth is None:
         who = "Only experiments with a `truth` function have it, such as the cases of the paper"
         raise InputError(f"the true maximum of {experiment.name!r} is not known. {who}.")

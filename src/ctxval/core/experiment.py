@@ -28,7 +28,7 @@ class Experiment:
     """A validation with its defaults, as ``ctxval run`` runs it; it gets the names and units as its labels.
 
     A UnitsWarning says that the distance, without weights and scales, adds states of different units, or of another
-    unit than its own, or that the task function takes a parameter as a state of another unit.
+    unit than its own.
     """
 
     name: str  #: a short name for files and displays
@@ -48,7 +48,7 @@ class Experiment:
             object.__setattr__(self, name, getattr(labels, name))
         if labels != given:
             object.__setattr__(self, "validation", self.validation.with_parts(labels=labels))
-        for doubt in filter(None, (self.doubt_of_units, self.doubt_of_parameters)):
+        if (doubt := self.doubt_of_units) is not None:
             warnings.warn(doubt, UnitsWarning, stacklevel=3)
 
     @property
@@ -77,14 +77,14 @@ class Experiment:
     def doubt_of_parameters(self) -> str | None:
         """Why a task parameter is taken as a state without a conversion of its unit; None if all is well.
 
-        Their numbers are compared in some random tasks, so a task function that converts the unit gives no doubt.
+        Their numbers are compared in four random tasks, so a task function that converts the unit gives no doubt.
         """
         space = self.validation.space
         if not any(parted(label)[1] for label in space.labels):
             return None
         try:
             points = space.iid(4, np.random.default_rng(0))
-            tasks = [self.validation.task_at(space.parameters(point)) for point in points]
+            tasks = [self.validation.task(space.parameters(point)) for point in points]
             states = list(self.names(tasks[0].initial_state.shape[-1], 0)[0].items())
             taken = {"initial": [task.initial_state for task in tasks], "goal": [task.goal for task in tasks]}
             for (what, values), (column, label) in product(taken.items(), enumerate(space.labels)):

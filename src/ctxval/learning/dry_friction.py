@@ -28,7 +28,9 @@ _SWEEPS = 4  # each time, of the inputs, whose frictions act on each other's rat
 _EXPLAINED = 0.7  # share of the squared residuals, beside a linear function, that must be left at most
 _REST = 0.05  # share of the root mean square of a rate below which the joint is at rest
 _PER_COEFFICIENT = 5  # fewest recorded steps for each coefficient of the linear function
-_SLOW = np.geomspace(_REST, 0.5, 15)  # rates up to which friction is larger, as shares like _REST
+_SLOW = np.geomspace(_REST, 0.25, 11)  # rates up to which friction is larger, as shares like _REST
+_KNOWN = 0.1  # least share of the squares of inputs that no linear function of the state has, to know what inputs do
+_SLIPS = 3  # times that the friction of a joint that slips follows from its rate
 _LARGER = 0.5  # share of the squared residuals that must be left at most if friction has one more shape
 
 
@@ -63,22 +65,25 @@ class DryFriction:
         """Return the friction ``(..., m)`` that holds joints, but for their creep, if it can, from a first guess."""
         m, of_rates, force = len(self.rates), effects[..., self.rates, :], force.copy()
         before = x[..., self.rates]
-        at_first = self._limits(u, before, before)
         with np.errstate(all="ignore"):  # states of draws that diverge
+            at_first = self._limits(u, before, before)
             for j in [*range(m)] * (_SWEEPS if m > 1 else 1):  # projected Gauss-Seidel
                 own, limit = of_rates[..., j, j], at_first[..., j]
                 rate = reached[..., self.rates[j]] - (of_rates[..., j, :] * force).sum(axis=-1)
                 free = rate + own * force[..., j]
                 holding = np.nan_to_num(free / (own + np.sign(own) * self.creep[j]))
-                slipping = free - own * np.clip(holding, -limit, limit)
-                less = self._limits(u, before, slipping[..., None])[..., j]  # once it slips
-                limit = np.where(np.abs(holding) <= limit, limit, less)
+                if self.excess[j]:
+                    slips, after = np.abs(holding) > limit, before.copy()
+                    for _ in range(_SLIPS):
+                        after[..., j] = free - own * np.clip(holding, -limit, limit)
+                        limit = np.where(slips, self._limits(u, before, after)[..., j], limit)
                 force[..., j] = np.clip(holding, -limit, limit)
         return force
 
     def _limits(self, u: Array, before: Array, after: Array) -> Array:
         """Return the largest friction in steps with these inputs and between these rates; shapes ``(..., m)``."""
-        return self.sliding + self.load * np.abs(u) + self.excess * _slowness(before, after, self.slow)
+        largest = self.sliding + self.load * np.abs(u)
+        return largest + self.excess * _slowness(before, after, self.slow) if self.excess.any() else largest
 
     def acting(self, transitions: Transitions) -> tuple[Transitions, Mask]:
         """Return transitions with the inputs that act, and of which the friction is known ``(N,)``: all joints move."""
@@ -91,7 +96,7 @@ class DryFriction:
 def found_friction(model: Model, transitions: Transitions) -> DryFriction | None:
     """Return M with the friction that explains transitions best; None if friction does not explain much of them.
 
-    It is estimated beside a linear function of state and input, because M may be wrong in other ways, too.
+    It is estimated beside a linear function of state and input and drag, because M may be wrong in other ways, too.
     """
     x, u = transitions.x, transitions.u
     ranges = np.abs(u).max(axis=0, initial=0.0)
@@ -102,7 +107,10 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
     rates = strength.argmax(axis=0)
     directions = _directions(transitions, rates)
     moving = (directions != 0).all(axis=1)
-    features = np.column_stack([np.ones(len(x)), x / standard_deviations(x), u / ranges])[moving]
+    usual = np.sqrt((transitions.x_next[:, rates] ** 2).mean(axis=0))
+    fast = x[:, rates] / np.maximum(usual, 1e-300)
+    plain = [np.ones(len(x)), x / standard_deviations(x)]
+    features = np.column_stack([*plain, fast * np.abs(fast), u / ranges])[moving]
     if len(set(rates.tolist())) < len(rates) or len(features) < _PER_COEFFICIENT * features.shape[1]:
         return None
     residuals, of_rates = (transitions.x_next - reached)[moving][:, rates], effects[moving][:, rates]
@@ -110,7 +118,6 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
     if not (np.isfinite(of_rates).all() and np.isfinite(sizes).all() and (sizes > 0).all()):
         return None
     m, linear = len(rates), np.linalg.qr(features)[0]
-    usual = np.sqrt((transitions.x_next[:, rates] ** 2).mean(axis=0))
     before, after = x[moving][:, rates], transitions.x_next[moving][:, rates]
 
     def beside_linear(values: Array) -> Array:
@@ -119,29 +126,35 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
 
     left = beside_linear(residuals / sizes)
 
+    # Under feedback with fixed gains, what inputs change cannot be told from what states do.
+    by_state = np.linalg.qr(features[:, :-m])[0]
+    inputs = features[:, -m:]
+    known = (((inputs - by_state @ (by_state.T @ inputs)) ** 2).sum(axis=0) > _KNOWN * (inputs**2).sum(axis=0)).all()
+
     def fitted(shapes: Sequence[Array]) -> tuple[float, Array]:
         """Return what is left if friction has some shapes ``(N, m)``, and the sizes of each at each input."""
         acting = of_rates  # the change of each rate by a unit of each input (N, m, m)
-        for _ in range(3):
+        for _ in range(3 if known else 1):
             forces = np.concatenate([-acting * shape[:, None, :] for shape in shapes], axis=2)
-            largest, rest = nnls(beside_linear(forces / sizes[:, None]).reshape(-1, forces.shape[2]), left.ravel())
-            # The linear function is one of the inputs that act, so it changes what friction does.
-            slopes = np.linalg.lstsq(features, residuals - forces @ largest)[0][-m:] / ranges[:, None]
-            acting = of_rates + slopes.T
-        return float(rest), largest.reshape(len(shapes), m)
+            largest, left_over = nnls(beside_linear(forces / sizes[:, None]).reshape(-1, forces.shape[2]), left.ravel())
+            # The linear function is one of the inputs that act, so it changes what friction does, by half at most.
+            slopes = (np.linalg.lstsq(features, residuals - forces @ largest)[0][-m:] / ranges[:, None]).T
+            most = 0.5 * np.abs(of_rates).mean(axis=0)
+            acting = of_rates + np.clip(slopes, -most, most)
+        return float(left_over), largest.reshape(len(shapes), m)
 
     moves = directions[moving]
-    rest, largest = fitted([moves])
-    if not rest**2 < _EXPLAINED * (left**2).sum():
+    left_over, largest = fitted([moves])
+    if not left_over**2 < _EXPLAINED * (left**2).sum():
         return None
     shapes = [moves, moves * np.abs(u[moving])]
     loaded, by_load = fitted(shapes)
-    if grows := loaded**2 < _LARGER * rest**2:
-        rest, largest = loaded, by_load
+    if grows := loaded**2 < _LARGER * left_over**2:
+        left_over, largest = loaded, by_load
     shapes = shapes if grows else [moves]
     slowed = {slow: fitted([*shapes, moves * _slowness(before, after, slow * usual)]) for slow in _SLOW.tolist()}
     slow = min(slowed, key=lambda each: slowed[each][0])
-    if falls := slowed[slow][0] ** 2 < _LARGER * rest**2:
+    if falls := slowed[slow][0] ** 2 < _LARGER * left_over**2:
         largest = slowed[slow][1]
     load, excess = largest[1] if grows else np.zeros(m), largest[-1] if falls else np.zeros(m)
     creep = _creep(transitions, reached, effects, rates)

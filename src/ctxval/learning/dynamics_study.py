@@ -39,8 +39,8 @@ _FEWEST_HELD = 4  # executions from which on dry friction is looked for
 _WELL = 0.1  # left-out error below which neither these data nor task parameters are asked about
 _CLEARLY = 3.0  # factor by which predictions must err less without these data, or with a parameter, and err little
 _HALF = 0.5  # share of the left-out error of rates that dry friction must leave at most
-_CLEAR = 0.8  # the same of its square from which on noise may hide which one is larger
 _KEPT = 2.0  # the same, of friction that was found before: single steps tell less of it than closed loops do
+_NOISE = 0.75  # largest share of the squares of these errors that counts as noise
 _SLOW = 0.02  # seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores
 
 
@@ -322,7 +322,10 @@ class DynamicsStudy(ShortRepr):
         extended, model = self.extended.executions(executed), before_refinement(self.validation.model)
         recorded = self._recorded(extended, (), with_data=False) if extended else None
         with single_threaded(), np.errstate(all="ignore"):
-            friction = None if recorded is None else found_friction(model, recorded[0])
+            friction = None
+            if recorded is not None:
+                with contextlib.suppress(RuntimeError):  # of the least squares
+                    friction = found_friction(model, recorded[0])
         if friction is None:
             return None
         return DynamicsStudy(self.given, self.seed, self.quantile, self.extended, friction)
@@ -386,13 +389,13 @@ class DynamicsStudy(ShortRepr):
 def _error_of_rates(held: LearnedDynamics | None, without: LearnedDynamics) -> float:
     """Return the left-out error of the rates that friction slows, as a share of that without it; infinity for None.
 
-    Noise is left out if errors are clearly smaller with friction. Where a joint stops within a step changes
+    What the Gaussian processes take for noise is no part of them. Where a joint stops within a step changes
     its position a little, which nothing predicts.
     """
     if held is None or held.study.friction is None:
         return np.inf
     rates = held.study.friction.rates
     noise = (held.posterior.deviations[rates] / np.maximum(held.model_errors[rates], 1e-300)) ** 2
-    with_it, without_it = (float((each.left_out_errors[rates] ** 2).sum()) for each in (held, without))
-    least = min(float(noise.sum()), with_it) if with_it < _CLEAR * without_it else 0.0
-    return float(np.sqrt((with_it - least) / max(without_it - least, 1e-300)))
+    squares, squares_without = (float((each.left_out_errors[rates] ** 2).sum()) for each in (held, without))
+    noise_alone = min(float(noise.sum()), _NOISE * min(squares, squares_without))
+    return float(np.sqrt((squares - noise_alone) / max(squares_without - noise_alone, 1e-300)))

@@ -35,8 +35,8 @@ LEFT_OUT = (
 )
 BEYOND = "predicted runs leave the recorded range of {gap}"
 DIVERGED = (
-    "predicted runs diverge: they leave the recorded range of states and inputs by more than ten times its width, so "
-    "too little is learned to predict them; begin with smaller tasks, and be ready to stop the system"
+    "predicted runs diverge: they leave the records by more than ten times the range that most of them visit, so "
+    "too little is learned to predict them; execute smaller tasks first, and be ready to stop the system"
 )
 GAP = "predicted runs enter a gap in the records of {gap}"
 PAIR_GAP = "predicted runs enter a gap in the joint records of {gap}"
