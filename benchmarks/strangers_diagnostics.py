@@ -28,7 +28,8 @@ NAMES = {
     "noise is learned": "noise",
     "contradict the learned noise": "evidence against the noise",
     "understate the predictive uncertainty": "variance left out",
-    "leave the recorded range": "beyond the records",  # also if predicted runs diverge
+    "leave the recorded range of": "beyond the records",
+    "predicted runs diverge": "beyond the records",
     "enter a gap in the records": "gap",
     "enter a gap in the joint records": "joint gap",
     "hardly changes the closed loops": "untried parameter",
