@@ -112,5 +112,5 @@ def caught(results: Sequence[dict[str, Any]]) -> list[list[str]]:
         alone.update(single)
         for name in set(single):
             campaigns[name] += 1
-    order = sorted([*NAMES.values(), FAILED], key=lambda name: (-campaigns[name], -alone[name], -spoke[name]))
+    order = sorted([*dict.fromkeys(NAMES.values()), FAILED], key=lambda name: (-campaigns[name], -alone[name], -spoke[name]))
     return [[name, str(spoke[name]), str(alone[name]), str(campaigns[name])] for name in order]
