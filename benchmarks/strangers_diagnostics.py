@@ -112,5 +112,6 @@ def caught(results: Sequence[dict[str, Any]]) -> list[list[str]]:
         alone.update(single)
         for name in set(single):
             campaigns[name] += 1
-    order = sorted([*dict.fromkeys(NAMES.values()), FAILED], key=lambda name: (-campaigns[name], -alone[name], -spoke[name]))
+    known = dict.fromkeys([*NAMES.values(), FAILED])
+    order = sorted(known, key=lambda name: (-campaigns[name], -alone[name], -spoke[name]))
     return [[name, str(spoke[name]), str(alone[name]), str(campaigns[name])] for name in order]
