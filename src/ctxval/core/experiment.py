@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 
@@ -19,7 +20,7 @@ from ctxval.core.validation import Validation
 
 
 class UnitsWarning(UserWarning):
-    """Numbers of different units are added, compared or taken for each other."""
+    """A distance without weights or scales adds states of different units, or of another unit than its own."""
 
 
 @checked
@@ -82,7 +83,7 @@ class Experiment:
         space = self.validation.space
         if not any(parted(label)[1] for label in space.labels):
             return None
-        try:
+        with suppress(Exception):  # parts that do not fit together are refused where they are used
             points = space.iid(4, np.random.default_rng(0))
             tasks = [self.validation.task(space.parameters(point)) for point in points]
             states = list(self.names(tasks[0].initial_state.shape[-1], 0)[0].items())
@@ -97,8 +98,6 @@ class Experiment:
                             f"the task function takes the parameter {parameter} in {unit} as the {what} {state} in "
                             f"{wanted}, and does not convert it: convert it there, or state its range in {wanted}."
                         )
-        except Exception:  # parts that do not fit together are refused where they are used
-            return None
         return None
 
     def names(self, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:

@@ -4,9 +4,8 @@ Its force changes by a jump where a joint stops or turns, so it is no smooth fun
 recorded runs do not teach it to a Gaussian process. Here it is a part of the inputs, as in the time stepping of Moreau
 (1988): the inputs ``u - f`` act, with ``|f_j| <= c_j``, where f_j brings the rate that input j drives to rest if it
 can, and opposes it as strongly as it can otherwise. The limit c_j may grow with the input, as that of a gear does, and
-may be larger at rest than in motion (Stribeck 1902).
-What M misses is a smooth function of the state and the inputs that act. It is learned of steps in which all these rates
-move, because f is known there.
+may be larger at rest than in motion (Stribeck 1902). What M misses is a smooth function of the state and the inputs
+that act. It is learned of steps in which all these rates move, because f is known there.
 """
 
 from __future__ import annotations
@@ -117,31 +116,29 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
     sizes = np.sqrt((residuals**2).mean(axis=0))
     if not (np.isfinite(of_rates).all() and np.isfinite(sizes).all() and (sizes > 0).all()):
         return None
-    m, linear = len(rates), np.linalg.qr(features)[0]
+    m, inputs = len(rates), features[:, -len(rates) :]
     before, after = x[moving][:, rates], transitions.x_next[moving][:, rates]
-
-    def beside_linear(values: Array) -> Array:
-        flat = values.reshape(len(values), -1)
-        return (flat - linear @ (linear.T @ flat)).reshape(values.shape)
-
-    left = beside_linear(residuals / sizes)
-
+    linear, by_state = np.linalg.qr(features)[0], np.linalg.qr(features[:, :-m])[0]
     # Under feedback with fixed gains, what inputs change cannot be told from what states do.
-    by_state = np.linalg.qr(features[:, :-m])[0]
-    inputs = features[:, -m:]
-    known = (((inputs - by_state @ (by_state.T @ inputs)) ** 2).sum(axis=0) > _KNOWN * (inputs**2).sum(axis=0)).all()
+    known = ((_beside(by_state, inputs) ** 2).sum(axis=0) > _KNOWN * (inputs**2).sum(axis=0)).all()
+    left = _beside(linear, residuals / sizes)
 
     def fitted(shapes: Sequence[Array]) -> tuple[float, Array]:
         """Return what is left if friction has some shapes ``(N, m)``, and the sizes of each at each input."""
-        acting = of_rates  # the change of each rate by a unit of each input (N, m, m)
-        for _ in range(3 if known else 1):
+
+        def by(acting: Array) -> tuple[Array, Array, float]:
+            """Return forces, their sizes and what is left, if inputs change rates by ``acting`` ``(N, m, m)``."""
             forces = np.concatenate([-acting * shape[:, None, :] for shape in shapes], axis=2)
-            largest, left_over = nnls(beside_linear(forces / sizes[:, None]).reshape(-1, forces.shape[2]), left.ravel())
+            largest, norm = nnls(_beside(linear, forces / sizes[:, None]).reshape(-1, forces.shape[2]), left.ravel())
+            return forces, largest, float(norm)
+
+        forces, largest, left_over = by(of_rates)
+        for _ in range(2 if known else 0):
             # The linear function is one of the inputs that act, so it changes what friction does, by half at most.
             slopes = (np.linalg.lstsq(features, residuals - forces @ largest)[0][-m:] / ranges[:, None]).T
             most = 0.5 * np.abs(of_rates).mean(axis=0)
-            acting = of_rates + np.clip(slopes, -most, most)
-        return float(left_over), largest.reshape(len(shapes), m)
+            forces, largest, left_over = by(of_rates + np.clip(slopes, -most, most))
+        return left_over, largest.reshape(len(shapes), m)
 
     moves = directions[moving]
     left_over, largest = fitted([moves])
@@ -159,6 +156,12 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
     load, excess = largest[1] if grows else np.zeros(m), largest[-1] if falls else np.zeros(m)
     creep = _creep(transitions, reached, effects, rates)
     return DryFriction(model, rates, largest[0], load, excess, slow * usual, creep, 1e-3 * ranges)
+
+
+def _beside(basis: Array, values: Array) -> Array:
+    """Return what is left of values ``(N, ...)`` beside the columns of an orthonormal basis ``(N, k)``."""
+    flat = values.reshape(len(values), -1)
+    return (flat - basis @ (basis.T @ flat)).reshape(values.shape)
 
 
 def _slowness(before: Array, after: Array, slow: Array) -> Array:

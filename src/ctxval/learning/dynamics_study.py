@@ -321,11 +321,9 @@ class DynamicsStudy(ShortRepr):
         """Return a study of M with the dry friction that executions show; None if they show none."""
         extended, model = self.extended.executions(executed), before_refinement(self.validation.model)
         recorded = self._recorded(extended, (), with_data=False) if extended else None
-        with single_threaded(), np.errstate(all="ignore"):
-            friction = None
-            if recorded is not None:
-                with contextlib.suppress(RuntimeError):  # of the least squares
-                    friction = found_friction(model, recorded[0])
+        friction = None
+        with single_threaded(), np.errstate(all="ignore"), contextlib.suppress(RuntimeError):  # of the least squares
+            friction = None if recorded is None else found_friction(model, recorded[0])
         if friction is None:
             return None
         return DynamicsStudy(self.given, self.seed, self.quantile, self.extended, friction)

@@ -213,12 +213,13 @@ class LearnedDynamics(ShortRepr):
         """
         friction, sizes = self.study.friction, dict[str, float]()
         if friction is not None:
-            for j, label in enumerate(self.labels[-self.posterior.data.inputs :]):
-                name, unit = parted(label)
-                at_rest, share = *labels_of({f"{name} at rest": unit}), f"share of {name}"
-                excess = friction.excess[j]
-                known = (friction.sliding[j], friction.sliding[j] + excess if excess else 0.0, friction.load[j])
-                sizes |= dict(zip((label, at_rest, share), map(float, known), strict=True))
+            of_inputs = self.labels[-self.posterior.data.inputs :]
+            each_input = np.stack([friction.sliding, friction.excess, friction.load], axis=1).tolist()
+            for label, (sliding, excess, load) in zip(of_inputs, each_input, strict=True):
+                name, _ = parted(label)
+                sizes[label] = sliding
+                sizes[label.replace(name, f"{name} at rest", 1)] = sliding + excess if excess else 0.0
+                sizes[f"share of {name}"] = load
         return {label: size for label, size in sizes.items() if size}
 
     @functools.cached_property

@@ -165,6 +165,9 @@ def assess(
         executed = [_compared(campaign, trial, system, deviation) for trial, system in runs]
         d_a = max((deviated for _, deviated, _ in executed), default=0.0)
         verdict, certified, bound, doubt = _bound(campaign, distance.margin, options)
+        # `ctxval run` would execute tasks of the experiment's own distance.
+        reasons = (None if verdict is None else verdict.reason, doubt)
+        reason, doubt = (each and each.replace("`ctxval run`", "`ctxval safe`") for each in reasons)
         with stage("predicting the largest deviation", unit="closed loops"):
             predicted = _deviation_bound(campaign, runs, deviation, options.confidence)
         planner, unit = LoopPlanner(validation), space.members
@@ -187,7 +190,7 @@ def assess(
         spec=spec,
         margin=distance.margin,
         answer=None if verdict is None else verdict.answer,
-        reason=None if verdict is None else verdict.reason,
+        reason=reason,
         d_a=d_a,
         d_a_bound=d_a_bound,
         d_b=unsafe[0].on_model if unsafe else 0.0,
@@ -222,11 +225,6 @@ def _compared(
     return compared, float(deviation(model, system, task)), float(moved)
 
 
-def _executed_here(reason: str) -> str:
-    """Return a reason that names the command that executes tasks of a specification."""
-    return reason.replace("`ctxval run`", "`ctxval safe`")
-
-
 def _bound(
     campaign: Campaign, margin: float | None, options: CertificateOptions
 ) -> tuple[Verdict | None, Certificate | None, float | None, str | None]:
@@ -239,17 +237,15 @@ def _bound(
         )
     if margin is not None:
         verdict = campaign.verdict(margin, certificate=options)
-        verdict = replace(verdict, reason=_executed_here(verdict.reason))
         if verdict.answer == "validated":
             return verdict, verdict.certificate, margin, None
         return verdict, verdict.certificate, None, untested or verdict.reason.removesuffix(".")
     try:
         certified = campaign.certify(certificate=options)
     except CertificateError as error:
-        return None, None, None, untested or _executed_here(str(error)).removesuffix(".")
+        return None, None, None, untested or str(error).removesuffix(".")
     if certified.bound is None:
-        doubt = certified.doubt or "the certificate leaves out a share of the tasks"
-        return None, certified, None, untested or _executed_here(doubt)
+        return None, certified, None, untested or certified.doubt or "the certificate leaves out a share of the tasks"
     # Share of a bound on d_b by which a search may end below its largest value, which lies on a ridge: in the
     # study of ``docs/how-to/safety.md``, it ended by up to 0.2 % below.
     searched = max(certified.details.get("disagreement") or 0.0, 0.01)
