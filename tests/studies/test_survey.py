@@ -106,13 +106,14 @@ def test_an_angle_that_jumps_is_continued(tmp_path: Path) -> None:
     assert found.best.relative < 1e-3
 
 
-def test_unknown_names_are_states_and_what_stands_still_is_not(tmp_path: Path) -> None:
+@pytest.mark.parametrize("state", [("foo", "bar"), ("shoulder [deg]", "shoulder_rate"), ("Slide2", "slide2 speed")])
+def test_unknown_names_are_states_and_what_stands_still_is_not(state: tuple[str, str], tmp_path: Path) -> None:
     def odd(path: Path, one: Trajectory) -> None:
         rows = np.column_stack([one.times[:-1], one.states[:-1], one.inputs, np.full(one.horizon, 7.4)])
-        np.savetxt(path, rows, delimiter=",", header="time,foo,bar,u,supply", comments="")
+        np.savetxt(path, rows, delimiter=",", header=f"time,{','.join(state)},u,supply", comments="")
 
     found = survey([each(tmp_path / "csv", odd, ".csv")])
-    assert roles(found) == {"foo": "state", "bar": "state", "u": "input", "supply": ""}
+    assert roles(found) == {**dict.fromkeys(state, "state"), "u": "input", "supply": ""}
 
 
 def test_a_model_that_errs_is_said_to_suit_no_task(tmp_path: Path) -> None:

@@ -199,10 +199,15 @@ def _summary(logs: Sequence[Log], path: str, clock: Clock) -> FieldSummary:
     return FieldSummary(path, unit, len(values), period, low, high, "", remark)
 
 
-def _is(path: str, words: str) -> bool:
-    """Return whether the name of a field, without its unit, has one of some words."""
+def _words(path: str) -> list[str]:
+    """Return the words in the name of a field, without its unit."""
     name = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", named_unit(path)[0])
-    return not set(re.findall("[a-z]+", name.casefold())).isdisjoint(words.split())
+    return re.findall("[a-z]+|[0-9]+", name.casefold())
+
+
+def _is(path: str, words: str) -> bool:
+    """Return whether the name of a field has one of some words."""
+    return not set(_words(path)).isdisjoint(words.split())
 
 
 def _guessed(log: Log, fields: Sequence[FieldSummary], clock: Clock, guesses: list[str]) -> LogMapping:
@@ -216,7 +221,9 @@ def _guessed(log: Log, fields: Sequence[FieldSummary], clock: Clock, guesses: li
     inputs = [each.path for each in moving if _is(each.path, _INPUTS)]
     others = [each.path for each in moving if each.path not in inputs and _is(each.path, _OTHERS)]
     left = [each.path for each in moving if each.path not in (*inputs, *others)]
-    states = [path for path in left if _is(path, _STATES)] or left
+    rates = _RATES.split()
+    moved = [[word for word in _words(path) if word not in rates] for path in left if _is(path, _RATES)]
+    states = [path for path in left if _is(path, _STATES) or _words(path) in moved] or left  # shoulder, shoulder_rate
     if not states:
         raise InputError(
             f"{log.source} has no field that looks like a state; name the states and inputs with --state and --input. "
