@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 import shutil
@@ -25,7 +26,7 @@ import pytest
 import typer.main
 from hypothesis import settings
 
-from ctxval import Task, TaskSpace, Validation, controllers, distances, models, systems
+from ctxval import Task, TaskSpace, Transitions, Validation, controllers, distances, models, systems
 from ctxval.certificates import (
     CheckedPrediction,
     DynamicsEvidence,
@@ -106,6 +107,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if not item.get_closest_marker("thorough")]
 
 
+@functools.cache
+def recorded_swings() -> Transitions:
+    """Return the data of the model, which many tests learn again."""
+    return pendulum.record(pendulum.Pendulum(), pendulum.Settings(), seed=1)
+
+
 def make_validation(
     system: object = None, model: object = None, distance: object = None, horizon: int = 25
 ) -> Validation:
@@ -117,7 +124,7 @@ def make_validation(
         space=TaskSpace(goal=(-3.0, 3.0, "rad")),
         task=lambda p: Task([np.pi, 0.0], goal=[p.goal, 0.0], horizon=horizon, dt=0.02),
         system=system or systems.Simulated(step, vectorized=True),
-        model=model or models.Linear.fit(pendulum.record(rod, settings_, seed=1)),
+        model=model or models.Linear.fit(recorded_swings()),
         synthesizer=controllers.LQR([1.0, 0.1], [1e-2], [10.0, 1.0]),
         distance=distance or distances.FinalState(norm=1),
     )
@@ -239,6 +246,12 @@ def one_in_full(request: pytest.FixtureRequest, smaller: pytest.MonkeyPatch, mod
     yield
     if in_full:
         make_smaller(smaller)
+
+
+@pytest.fixture
+def without_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Check experiments without measuring what a suggestion costs, which takes longer than all else."""
+    monkeypatch.setattr("ctxval.cli.config.check._cost", lambda validation, plans: iter(()))
 
 
 @pytest.fixture

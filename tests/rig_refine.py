@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from ctxval import Campaign, Task, TaskSpace, Transitions, Validation, controllers, distances, models, searches, systems
+from ctxval.certificates import Automatic, CertificateOptions
 from ctxval.studies.refinement import Refinement, refine
 
 THRESHOLD, BUDGET = 0.05, 14
+FEW_TESTS = CertificateOptions(Automatic(tests=2))
 FIRST = models.Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]])
 
 
@@ -52,7 +54,7 @@ def campaign(store: Path | None = None, **parts: Any) -> Campaign:
 
 
 def refined(store: Path | None = None, method: Any = "residual", **parts: Any) -> Refinement:
-    return refine(campaign(store, **parts), THRESHOLD, BUDGET, method=method)
+    return refine(campaign(store, **parts), THRESHOLD, BUDGET, method=method, certificate=FEW_TESTS)
 
 
 if __name__ == "__main__":
@@ -60,4 +62,4 @@ if __name__ == "__main__":
 
     made = campaign(Path(sys.argv[1]))
     print("ready", flush=True)
-    refine(made, THRESHOLD, BUDGET)
+    refine(made, THRESHOLD, BUDGET, certificate=FEW_TESTS)

@@ -36,9 +36,9 @@ def strings(path: Path) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "src").rglob("*.py")), ids=lambda path: path.stem)
-def test_no_message_weakens_a_bound(path: Path) -> None:
-    assert not [text for text in strings(path) if WEAKENS.search(text)]
+def test_no_message_weakens_a_bound() -> None:
+    for path in sorted((ROOT / "src").rglob("*.py")):
+        assert not [text for text in strings(path) if WEAKENS.search(text)], path
 
 
 @pytest.mark.parametrize(

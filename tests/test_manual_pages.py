@@ -22,7 +22,9 @@ from browser import accessibility_findings
 ROOT = Path(__file__).parents[1]
 GALLERY = sorted((ROOT / "examples" / "gallery").glob("plot_*.py"))
 LONG = (
+    "plot_1_pendulum",
     "plot_1_pendulum_noisy",
+    "plot_2_arm",
     "plot_3_dubins",
     "plot_4_linear",
     "plot_6_aspect1",

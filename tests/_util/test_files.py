@@ -39,6 +39,7 @@ from ctxval._util.files import (
 from ctxval.cli.config.parts import recorded
 from ctxval.core.exchange import read_task
 from ctxval.errors import InputError, ShapeError
+from rig_thorough import more
 
 POSIX = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs FIFOs and devices")
 
@@ -396,7 +397,7 @@ def test_hostile_archives_give_one_error_in_little_memory(name: str) -> None:
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.int8])
+@pytest.mark.parametrize("dtype", [np.int8, *more(np.float64)])
 def test_a_bomb_is_refused_before_it_is_unpacked(dtype: Any) -> None:
     zeros = np.zeros((2**22, 1), dtype=dtype)
     bomb = saved(True, times=np.zeros(2**22, dtype=dtype), states=zeros, inputs=zeros[1:])

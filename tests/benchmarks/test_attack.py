@@ -107,10 +107,11 @@ def ran(monkeypatch: pytest.MonkeyPatch, folder: Path, act: Callable[[], object]
         ("os.chmod('kept', 0o777)", "files"),
         ("os.rename('../outside/secret.csv', '../outside/x.csv')", "files"),
         ("open('home/.netrc', 'w').close()", "files"),
-        ("x = bytearray(800 * 2**20); x[::4096] = b'1' * len(x[::4096])", "memory"),
+        ("x = bytearray(300 * 2**20); x[::4096] = b'1' * len(x[::4096])", "memory"),
     ],
 )
 def test_the_cage_notices(code: str, wrong: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(cage, "MEMORY", 200 * 2**20)
     assert wrong in ran(monkeypatch, tmp_path, lambda: exec(code, NAMES))
 
 

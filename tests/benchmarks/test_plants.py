@@ -42,7 +42,7 @@ from plants.truths import TRUTHS, truth  # noqa: E402
 from study_auto import first_within  # noqa: E402
 from study_plants import STORED, run, version_of  # noqa: E402
 
-SLOW = ("automatic-transmission", "f16-pull-up", "wind-turbine")
+SLOW = ("automatic-transmission", "f16-pull-up", "fuel-control", "magnetic-levitation", "wind-turbine")
 EACH = [pytest.param(name, marks=[pytest.mark.thorough] * (name in SLOW)) for name in PLANTS]
 """All plants; those whose executions are slow are executed often by `make thorough` alone."""
 

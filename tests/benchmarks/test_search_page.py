@@ -21,6 +21,7 @@ from study_auto import CASES, KEY, first_within, results_of, stored  # noqa: E40
 TARGETS = search_page.targets()
 
 
+@pytest.mark.thorough  # test_study_pages.py does the same
 def test_the_page_is_what_the_stored_results_give() -> None:
     assert search_page.PAGE.read_text() == search_page.text()
 

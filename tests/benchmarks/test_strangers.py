@@ -68,6 +68,7 @@ def test_both_halves_have_every_family_and_share_no_system() -> None:
     assert counts["contact"] + counts["pocket"] >= 5
 
 
+@pytest.mark.thorough
 def test_they_spread_over_dimensions() -> None:
     tasks = [entry.dimensions()[0] for entry in ENTRIES.values()]
     states = [strangers_truths.states_and_inputs(entry)[0] for entry in ENTRIES.values()]

@@ -158,7 +158,7 @@ def test_asking_by_command_chooses_what_a_campaign_chooses(invoke: Any) -> None:
     sys.path.insert(0, os.getcwd())
     import my_rig  # type: ignore[import-not-found]
 
-    for number in range(4):
+    for number in range(3):
         target = ("a.sqlite",) if number else ("my_rig:experiment", "--store", "a.sqlite")
         report = asked(invoke, *target, "--explore")
         record(report["folder"])
@@ -649,7 +649,8 @@ def test_several_terminals_ask_and_tell_at_once(invoke: Any) -> None:
 
 @pytest.mark.slow
 def test_an_asking_campaign_learns_what_others_stored(validation: Any, tmp_path: Path) -> None:
-    first, second = (Campaign(validation, store=tmp_path / "a.sqlite", seed=3) for _ in range(2))
+    store, search = tmp_path / "a.sqlite", searches.GPUCB()
+    first, second = (Campaign(validation, search=search, store=store, seed=3) for _ in range(2))
     opened = first.ask()
     assert second.ask().number == 1
     assert first.ask().number == 2

@@ -79,7 +79,7 @@ def test_running_in_pieces_equals_running_at_once(validation: Validation, tmp_pa
 
 @pytest.mark.slow
 def test_the_budget_is_a_total(validation: Validation) -> None:
-    campaign = Campaign(validation).run(5, explore=True)
+    campaign = gp_ucb(validation).run(5, explore=True)
     assert len(campaign.run(5, explore=True).trials) == 5
     assert len(campaign.run(3, explore=True).trials) == 5
 
@@ -143,7 +143,7 @@ def test_failures_are_data(validation: Validation) -> None:
 
 
 def test_a_failure_is_told_with_what_was_recorded_before(validation: Validation) -> None:
-    campaign = Campaign(validation)
+    campaign = gp_ucb(validation)
     opened = campaign.ask()
     whole = validation.execute(opened.plan)
     states = whole.states.copy()
@@ -322,7 +322,7 @@ def test_a_trial_can_be_told_later_by_its_number(validation: Validation, tmp_pat
 
 @pytest.mark.slow
 def test_running_leaves_trials_that_were_asked_by_hand_open(validation: Validation) -> None:
-    campaign = Campaign(validation)
+    campaign = gp_ucb(validation)
     opened = campaign.ask()
     campaign.run(4, explore=True)
     assert campaign.trials[0].state == "open"
@@ -355,7 +355,7 @@ def test_a_short_trajectory_told_by_hand_leaves_the_trial_open(validation: Valid
     [((99,), "there is no trial 99"), ((0,), "a trajectory, a distance or the reason")],
 )
 def test_telling_nonsense_is_refused(validation: Validation, told: tuple[int, ...], sentence: str) -> None:
-    campaign = Campaign(validation)
+    campaign = gp_ucb(validation)
     campaign.ask()
     with pytest.raises(InputError, match=sentence):
         campaign.tell(*told)
@@ -694,7 +694,7 @@ def test_two_processes_do_not_run_one_store(validation: Validation, tmp_path: Pa
 
 
 def test_an_open_trial_of_another_campaign_is_refused(validation: Validation) -> None:
-    here, there = Campaign(validation, seed=1), Campaign(validation, seed=2)
+    here, there = gp_ucb(validation, seed=1), gp_ucb(validation, seed=2)
     here.ask()
     opened = there.ask()
     with pytest.raises(InputError, match="another campaign"):

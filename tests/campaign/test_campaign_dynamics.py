@@ -10,6 +10,7 @@ from ctxval import Campaign, Labels, Trajectory, searches
 from ctxval.certificates import LearnedDistance, Sample, require_learned
 from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy
+from rig_thorough import more
 
 POINTS = np.linspace(0.05, 0.95, 7)[:, None]
 
@@ -64,7 +65,7 @@ def test_a_sample_keeps_the_predictions_and_a_kind_asks_for_them() -> None:
     ("labels", "coordinates"),
     [
         (Labels(("angle [rad]", "rate [rad/s]"), ("torque [N m]",)), ["angle [rad]", "rate [rad/s]", "torque [N m]"]),
-        (Labels(), ["x[0]", "x[1]", "u[0]"]),
+        *more((Labels(), ["x[0]", "x[1]", "u[0]"])),
     ],
 )
 def test_evidence_names_states_and_inputs_as_the_experiment_does(labels: Labels, coordinates: list[str]) -> None:

@@ -49,6 +49,7 @@ def test_linear_systems_take_two_executions_more_than_they_have_states(seed: int
 
 @pytest.mark.slow
 @pytest.mark.parametrize("with_data", [True, *more(False)])
+@pytest.mark.thorough
 def test_running_in_pieces_equals_running_at_once(tmp_path: Path, with_data: bool) -> None:
     def validation() -> Validation:
         return make_validation() if with_data else no_data(make_validation())

@@ -10,6 +10,7 @@ from conftest import make_validation
 from ctxval import Campaign, searches
 from ctxval.campaign.history import history_of
 from ctxval.core.trial import Trial
+from rig_thorough import more
 
 
 def trial(number: int, goal: float, distance: float | None = None) -> Trial:
@@ -25,7 +26,7 @@ def test_a_point_that_waits_for_its_value_is_in_the_history_once() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("data", [True, False])
+@pytest.mark.parametrize("data", [False, *more(True)])
 def test_auto_goes_on_although_distances_were_told_without_trajectories(tmp_path: Path, data: bool) -> None:
     validation = make_validation()
     if not data:

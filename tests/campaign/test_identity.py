@@ -239,8 +239,8 @@ def test_a_failure_cannot_be_dropped(store: Path) -> None:
     "search",
     [
         SEARCH(beta=3.0, noise=(1e-6, 0.5)),
-        searches.Auto("fast"),
         *more(
+            searches.Auto("fast"),
             searches.Auto(40),
             searches.Random(),
             searches.SamplingDiscarding(2),

@@ -58,6 +58,7 @@ def test_a_bound_on_the_quantile_is_validated_and_says_so(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_one_execution_above_the_threshold_is_not_enough() -> None:
     validation = cart()
     largest = largest_quantile(validation)

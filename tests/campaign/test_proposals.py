@@ -112,6 +112,7 @@ def test_people_cost_more_than_all_thinking_and_untimed_executions_cost_nothing_
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_number_of_designs_makes_the_same_choices_each_time() -> None:
     campaigns = [Campaign(make_validation(), search=searches.Auto(60), seed=4).run(3, explore=True) for _ in range(2)]
     points = [[trial.unit_point for trial in campaign.trials] for campaign in campaigns]

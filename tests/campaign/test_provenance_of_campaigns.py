@@ -17,6 +17,7 @@ from ctxval.certificates import CertificateOptions, Posterior
 from ctxval.cli import app
 from ctxval.errors import ForeignStoreError
 from ctxval.report.context import context_of_campaign
+from rig_thorough import more
 
 BY = CertificateOptions(Posterior(resolution=1.0))
 LOOKED = "the threshold was stated after"
@@ -39,7 +40,7 @@ def test_a_threshold_that_was_stated_first_is_no_remark() -> None:
     assert [(each.threshold, each.distances) for each in made.store.thresholds() or ()] == [(50.0, 0)]
 
 
-@pytest.mark.parametrize("in_memory", [True, False])
+@pytest.mark.parametrize("in_memory", [False, *more(True)])
 def test_a_threshold_chosen_after_looking_is_said_once_and_for_all(tmp_path: Path, in_memory: bool) -> None:
     store = None if in_memory else tmp_path / "a.sqlite"
     made = campaign(store).run(6)

@@ -87,7 +87,7 @@ def test_the_tasks_of_a_search_are_steady(search: searches.Search) -> None:
 
 
 @pytest.mark.parametrize(
-    "search", [searches.Auto("fast"), *more(searches.CMAES(), searches.Repeated(searches.GPUCB(), 2))]
+    "search", [searches.CMAES(), *more(searches.Auto("fast"), searches.Repeated(searches.GPUCB(), 2))]
 )
 def test_a_resumed_campaign_chooses_the_same_tasks(search: searches.Search, tmp_path: Path) -> None:
     def tasks(campaign: Campaign) -> list[Any]:

@@ -94,7 +94,7 @@ def test_every_text_says_that_a_volume_is_a_probability_under_it(kind: Certifica
 
 @pytest.mark.slow
 def test_predicted_tasks_follow_it_too() -> None:
-    campaign = Campaign(narrow(), search=searches.Auto(), seed=2).run(6, explore=True).audit(30)
+    campaign = Campaign(narrow(), search=searches.Auto(), seed=2).run(3, explore=True).audit(5)
     learned = campaign.provenance.learned
     assert learned is not None
     tasks = campaign.validation.space.from_unit(learned.tasks(2000, 6))[:, 0]

@@ -115,6 +115,7 @@ def test_a_recursion_limit_that_a_system_sets_is_its_own() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_run_ends_with_a_report_if_the_system_leaves_hard(tmp_path: Path) -> None:
     (tmp_path / "rig.py").write_text(
         textwrap.dedent("""
@@ -168,7 +169,8 @@ def test_run_refuses_what_tell_refuses(act: Any, said: str, workers: int | None)
 def test_how_far_elsewhere_a_start_may_be_is_the_validations() -> None:
     validation = make_validation(system=Doing(shifted))
     validation.start_tolerance = 10.0
-    assert [t.state for t in Campaign(validation).run(2).trials] == ["completed"] * 2
+    campaign = Campaign(validation, search=searches.Random()).run(2)
+    assert [t.state for t in campaign.trials] == ["completed"] * 2
 
 
 # A distance that gives nothing usable for the system, which no trial with the model alone shows

@@ -154,9 +154,9 @@ def test_the_search_knows_what_is_being_executed(tmp_path: Path) -> None:
 
 def test_a_surrogate_search_proposes_distinct_points_to_all_workers(tmp_path: Path) -> None:
     validation = make_validation(system=Logging(str(tmp_path), 0.02))
-    campaign = Campaign(validation, search=searches.GPUCB(), seed=1).run(14, workers=4)
+    campaign = Campaign(validation, search=searches.GPUCB(), seed=1).run(10, workers=4)
     points = np.array([trial.unit_point for trial in campaign.trials])
-    assert len(np.unique(points, axis=0)) == 14
+    assert len(np.unique(points, axis=0)) == 10
 
 
 def test_the_budget_is_a_total_and_interrupted_trials_come_first(tmp_path: Path) -> None:
@@ -228,7 +228,9 @@ def test_an_execution_that_kills_every_worker_fails_in_the_end(tmp_path: Path) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hard", [False, True])
-def test_an_execution_that_hangs_is_ended(tmp_path: Path, hard: bool) -> None:
+def test_an_execution_that_hangs_is_ended(tmp_path: Path, hard: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if hard:
+        monkeypatch.setattr("ctxval.campaign.workers._GRACE_PERIOD", 0.2)
     campaign = run_of(Deadly(tmp_path, hang=1, hard=hard), 4, workers=2, timeout=0.5)
     assert not (tmp_path / "woken").exists()
     assert [trial.failure for trial in campaign.failed] == ["the execution did not end within 0.5 s"]
@@ -373,7 +375,8 @@ def test_a_thread_that_hangs_is_given_up() -> None:
             raise RuntimeError
 
     with cf.ThreadPoolExecutor(2) as executor:
-        campaign = Campaign(make_validation(system=Hanging())).run(2, executor=executor, timeout=0.2)
+        campaign = Campaign(make_validation(system=Hanging()), search=searches.Random())
+        campaign.run(2, executor=executor, timeout=0.2)
         release.set()
     assert [trial.failure for trial in campaign.trials] == ["the execution did not end within 0.2 s"] * 2
 

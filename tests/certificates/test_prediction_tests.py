@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import cache
 from itertools import combinations, permutations, product
 from typing import get_args
 
@@ -102,12 +103,19 @@ SETS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
+@cache
+def drawn(dimension: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the tests of 4000 campaigns, and many tasks."""
+    rng = np.random.default_rng(0)
+    tests = np.array([latin_hypercube(TESTS, dimension, rng) for _ in range(4000)])
+    return tests, rng.random((200_000, dimension))
+
+
 @pytest.mark.parametrize("dimension", [1, 2, 3])
 @pytest.mark.parametrize("name", SETS)
 def test_sets_are_missed_as_rarely_as_the_bound_says(name: str, dimension: int) -> None:
-    rng = np.random.default_rng(0)
-    tests = np.array([latin_hypercube(TESTS, dimension, rng) for _ in range(4000)])
-    outside = SETS[name](rng.random((200_000, dimension))).mean()
+    tests, tasks = drawn(dimension)
+    outside = SETS[name](tasks).mean()
     for inside in (True, False):
         kept = float(outside if inside else 1 - outside)
         for count in (3, TESTS):

@@ -13,6 +13,8 @@ from typer.testing import CliRunner
 
 from ctxval.cli import app
 
+pytestmark = pytest.mark.usefixtures("without_costs")
+
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:

@@ -93,16 +93,6 @@ def test_a_counterexample_stands_beside_the_map(store: str) -> None:
     assert report["volume"] > 1 - report["details"]["share_kept"]
 
 
-def test_options_are_given_by_name_and_checked(store: str) -> None:
-    one = json.loads(invoke("certify", store, "--kind", "region", "--discard", "2", "--json").stdout)
-    assert one["details"]["discarded"] == 2
-    few = json.loads(invoke("certify", store, "--kind", "region", "--option", "predictions=50", "--json").stdout)
-    assert few["details"]["predictions"] == 50
-    refused = invoke("certify", store, "--kind", "region", "--option", "tests=3")
-    assert refused.exit_code == 2
-    assert "tests is for certificates of the kind auto or dynamics" in refused.stderr
-
-
 FILE = """
 name = "rotor"
 [space]
@@ -135,6 +125,20 @@ def step(x, u):
 
 
 RUN = ("run", "rotor.toml", "--budget", "4", "--store", "r.sqlite", "--search", "cma-es", "--no-report")
+
+
+def test_options_are_given_by_name_and_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("option_parts.py").write_text(PARTS)
+    Path("rotor.toml").write_text(FILE.replace("rotor_parts", "option_parts"))
+    assert invoke(*RUN).exit_code == 0
+    assert invoke("certify", "r.sqlite", "--audit", "12").exit_code == 0
+    options = ("--discard", "2", "--option", "predictions=50")
+    found = json.loads(invoke("certify", "r.sqlite", "--kind", "region", *options, "--json").stdout)
+    assert (found["details"]["discarded"], found["details"]["predictions"]) == (2, 50)
+    refused = invoke("certify", "r.sqlite", "--kind", "region", "--option", "tests=3")
+    assert refused.exit_code == 2
+    assert "tests is for certificates of the kind auto or dynamics" in refused.stderr
 
 
 def test_code_of_another_user_is_asked_about_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

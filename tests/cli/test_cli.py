@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import typer
@@ -309,18 +309,31 @@ def stored(folder: Path, *arguments: str) -> Path:
         os.chdir(before)
 
 
-@pytest.fixture(scope="session")
-def campaigns(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Campaigns of two cases, searched and drawn."""
-    folder = tmp_path_factory.mktemp("campaigns")
+class Stores(dict[str, Path]):
+    """Stores of campaigns of two cases, searched and drawn; those of a case are run when one is needed first."""
+
     linear = ("linear", "--option", "dim=1", "--seed", "1")
     pendulum = ("pendulum", "--threshold", "1e-9")  # which the first execution decides: its verdict is not looked at
-    return {
-        "pendulum": stored(folder, *pendulum, "--budget", "12"),
-        "linear": stored(folder, *linear, "--budget", "12"),
-        "pendulum drawn": stored(folder, *pendulum, "--budget", "12", "--search", "random"),
-        "linear drawn": stored(folder, *linear, "--budget", "20", "--search", "random"),
+    commands: ClassVar = {
+        "pendulum": (*pendulum, "--budget", "12"),
+        "linear": (*linear, "--budget", "12"),
+        "pendulum drawn": (*pendulum, "--budget", "12", "--search", "random"),
+        "linear drawn": (*linear, "--budget", "20", "--search", "random"),
     }
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __missing__(self, name: str) -> Path:
+        case = name.removesuffix(" drawn")
+        for each in (case, f"{case} drawn"):
+            self[each] = stored(self.folder, *self.commands[each])
+        return self[name]
+
+
+@pytest.fixture(scope="session")
+def campaigns(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return Stores(tmp_path_factory.mktemp("campaigns"))
 
 
 KINDS = {

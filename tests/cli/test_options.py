@@ -69,6 +69,7 @@ def test_an_option_that_cannot_be_used_is_named(given_options: list[str], senten
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_costs")
 def test_any_option_of_a_case_can_be_set(invoke: Any) -> None:
     command = ("run", "linear", "--budget", "2", "--search", "random", "--json")
     result = invoke(*command, "--option", "dim=2", "--store", "a.sqlite")

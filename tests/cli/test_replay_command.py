@@ -118,6 +118,7 @@ def test_a_mapping_is_a_toml_file(invoke: Invoke) -> None:
     assert "cannot be combined" in refusal(invoke("run.mat", *LINEAR, "--mapping", "map.toml", "--state", "log.state"))
 
 
+@pytest.mark.thorough
 def test_a_lerobot_data_set_needs_no_mapping(invoke: Invoke) -> None:
     write_lerobot(Path("set"), [run(seed=seed) for seed in range(3)])
     found = report(invoke("set", *LINEAR, "--json"))

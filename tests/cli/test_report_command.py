@@ -17,6 +17,7 @@ from ctxval import Store
 from ctxval.report.context import context_of_store
 from ctxval.report.sections.repeat import command_of, repeating_command
 from rig_cli import calling
+from rig_thorough import more
 
 RIG = """
 from conftest import make_validation
@@ -195,15 +196,15 @@ def test_a_report_leaves_the_store_as_it_is(invoke: Any, store: Path) -> None:
     assert [repr(trial) for trial in Store.existing(kept).trials()] == before
 
 
-def test_a_report_does_not_replace_a_store(invoke: Any, store: Path) -> None:
-    for option, suffix in (("--out", "html"), ("--junit", "xml"), ("--markdown", "md")):
-        kept = Path(shutil.copy(store, f"copy.{suffix}"))
-        before = kept.read_bytes()
-        for forced in ((), ("--force",)):
-            done = invoke("report", "a.sqlite", option, str(kept), *forced)
-            assert done.exit_code == 2
-            assert ("ctxval did not write it", "is a store")[bool(forced)] in " ".join(done.stderr.split())
-            assert kept.read_bytes() == before
+@pytest.mark.parametrize(("option", "suffix"), [("--out", "html"), *more(("--junit", "xml"), ("--markdown", "md"))])
+def test_a_report_does_not_replace_a_store(invoke: Any, store: Path, option: str, suffix: str) -> None:
+    kept = Path(shutil.copy(store, f"copy.{suffix}"))
+    before = kept.read_bytes()
+    for forced in ((), ("--force",)):
+        done = invoke("report", "a.sqlite", option, str(kept), *forced)
+        assert done.exit_code == 2
+        assert ("ctxval did not write it", "is a store")[bool(forced)] in " ".join(done.stderr.split())
+        assert kept.read_bytes() == before
 
 
 def test_a_report_replaces_its_own_files_and_no_others(invoke: Any, store: Path) -> None:
@@ -215,7 +216,8 @@ def test_a_report_replaces_its_own_files_and_no_others(invoke: Any, store: Path)
         done = invoke("report", str(store), option, name)
         assert (done.exit_code, "ctxval did not write it" in " ".join(done.stderr.split())) == (2, True)
         assert Path(name).read_text() == "the work of a month"
-        assert invoke("report", str(store), option, name, "--force").exit_code == 0
+    assert invoke("report", str(store), *written, "--force").exit_code == 0
+    assert not [name for name in written[1::2] if Path(name).read_text() == "the work of a month"]
     Path("experiment.toml").write_text("name = 'a'")
     for options in (("--out", "experiment.toml"), ("--out", "a.html", "--junit", "a.html")):
         assert invoke("report", str(store), *options, "--force").exit_code == 2

@@ -30,6 +30,7 @@ def logs(tmp_path: Path) -> Path:
     return tmp_path / "logs"
 
 
+@pytest.mark.usefixtures("without_costs")
 def test_logs_lead_to_a_statement_and_to_files_that_work(logs: Path, tmp_path: Path) -> None:
     out, call = tmp_path / "start", calling()
     done = call("start", str(logs), "--out", str(out))

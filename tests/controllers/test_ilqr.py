@@ -12,6 +12,7 @@ from ctxval.core.rollout import rollout
 from ctxval.errors import DesignError, InputError, ModelError, ShapeError
 from ctxval.models import Linear
 from ctxval.systems.functions import rk4
+from rig_thorough import more
 
 DT = 0.05
 
@@ -216,7 +217,7 @@ def test_a_linear_model_without_a_jacobian_gives_the_same_trajectories() -> None
 # On a nonlinear model
 
 
-@pytest.mark.parametrize("goal", [-2.5, -1.0, 0.0, 1.0, 2.0, 3.0])
+@pytest.mark.parametrize("goal", [-1.0, 0.0, 3.0, *more(-2.5, 1.0, 2.0)])
 def test_the_solution_is_a_stationary_point_and_a_minimum_of_the_cost(goal: float) -> None:
     task = swing(goal=goal)
     solution = REGULATOR.solve(task, PENDULUM)
@@ -229,7 +230,7 @@ def test_the_solution_is_a_stationary_point_and_a_minimum_of_the_cost(goal: floa
     assert min(nearby) > solution.cost
 
 
-@pytest.mark.parametrize("goal", [-1.0, 0.5, 2.0])
+@pytest.mark.parametrize("goal", [0.5, *more(-1.0, 2.0)])
 def test_no_general_optimiser_finds_a_lower_cost_from_the_same_start(goal: float) -> None:
     task = swing(horizon=6, goal=goal)
     solution = REGULATOR.solve(task, PENDULUM)

@@ -144,7 +144,7 @@ def test_a_batch_of_distances_is_the_loop_over_them(distance: Distance, batch: t
 
 
 @pytest.mark.parametrize("distance", METRICS)
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(STATES, STATES, STATES)
 def test_a_distance_of_trajectories_is_a_metric(
     distance: Distance, a: np.ndarray, b: np.ndarray, c: np.ndarray
@@ -161,7 +161,7 @@ def test_a_distance_of_trajectories_is_a_metric(
 
 @pytest.mark.parametrize("distance", [each for each in METRICS if getattr(each, "monotone", False)])
 @given(states=STATES, others=STATES)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_no_further_deviation_makes_a_monotone_distance_smaller(
     distance: Distance, states: np.ndarray, others: np.ndarray
 ) -> None:

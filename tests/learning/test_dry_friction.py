@@ -178,8 +178,10 @@ def cart(step: Any = sticky_step) -> Validation:
     ("count", "shape", "friction"),
     [
         (4, {}, {"u[0]": GRIP}),
-        (6, {"excess": 0.4}, {"u[0]": GRIP, "u[0] at rest": 1.2}),
-        (6, {"grip": 0.2, "load": 0.2}, {"u[0]": 0.2, "share of u[0]": 0.2}),  # joints are also braked
+        *more(
+            (6, {"excess": 0.4}, {"u[0]": GRIP, "u[0] at rest": 1.2}),
+            (6, {"grip": 0.2, "load": 0.2}, {"u[0]": 0.2, "share of u[0]": 0.2}),  # joints are also braked
+        ),
     ],
     ids=["constant", "larger at rest", "by load"],
 )
@@ -198,6 +200,7 @@ def test_runs_that_stop_short_are_predicted_from_few_executions(
     np.testing.assert_allclose(expected, distances_, rtol=0, atol=0.05 * max(distances_))
 
 
+@pytest.mark.thorough
 def test_friction_is_found_in_records_with_noise() -> None:
     rng, validation = np.random.default_rng(0), cart()
     points, executed = rng.random((8, 2)), []

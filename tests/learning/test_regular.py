@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from ctxval import Trajectory, Transitions, models
@@ -43,8 +45,13 @@ def split_of(goals: np.ndarray, stiffness: float = 300.0) -> tuple[Transitions, 
 GOALS = np.array([-1.0, -0.6, -0.2, 0.3, 0.5, 0.7, 0.95, 1.1])
 
 
+@cache
+def usual_split() -> tuple[Transitions, RegularTransitions | None]:
+    return split_of(GOALS)
+
+
 def test_steps_that_touch_a_wall_are_irregular_and_the_others_are_not() -> None:
-    known, split = split_of(GOALS)
+    known, split = usual_split()
     assert split is not None
     touching = np.maximum(known.x[:, 0], known.x_next[:, 0]) > WALL
     assert touching.sum() > 15
@@ -56,7 +63,7 @@ def test_steps_that_touch_a_wall_are_irregular_and_the_others_are_not() -> None:
 
 
 def test_runs_cross_the_boundary_if_and_only_if_they_come_to_the_wall() -> None:
-    _, split = split_of(GOALS)
+    _, split = usual_split()
     assert split is not None
     parts = split.posterior()
     assert parts is not None
@@ -72,7 +79,7 @@ def test_runs_cross_the_boundary_if_and_only_if_they_come_to_the_wall() -> None:
 
 
 def test_executions_that_touched_it_can_be_left_out() -> None:
-    _, split = split_of(GOALS)
+    _, split = usual_split()
     assert split is not None
     without = split.posterior([6, 7])
     assert without is not None

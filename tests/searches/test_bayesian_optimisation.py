@@ -123,7 +123,7 @@ def test_values_that_are_all_the_same_and_negative_ones_do_no_harm() -> None:
 # Batches and failures
 
 
-@pytest.mark.parametrize("dimension", [1, 2, 20])
+@pytest.mark.parametrize("dimension", [1, 20, *more(2)])
 @pytest.mark.parametrize("told", [0, 20])
 def test_a_batch_of_questions_is_diverse(told: int, dimension: int) -> None:
     search = BayesianOptimisation()
@@ -166,6 +166,7 @@ def test_what_failed_is_not_asked_again_and_does_not_stop_the_search() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_it_keeps_the_contract_of_a_search() -> None:
     check_search(BayesianOptimisation(initial=1), dimension=5, budget=12)
     assert type(by_name("bayesian-optimisation", beta=1.0)) is BayesianOptimisation

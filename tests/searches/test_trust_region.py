@@ -13,7 +13,6 @@ from ctxval._util.describe import describe
 from ctxval.errors import InputError
 from ctxval.searches import Auto, BayesianOptimisation, Prediction, Random, TrustRegion
 from ctxval.searches.base import Note, Pending
-from ctxval.testing import check_search
 
 Function = Callable[[Array], Array]
 
@@ -113,15 +112,12 @@ def test_predictions_that_find_nothing_larger_are_hedged_though_they_are_right()
     assert values.max() > 3
 
 
-@pytest.mark.slow
 def test_without_a_prediction_the_scalar_search_goes_on_and_says_so() -> None:
     search, random = TrustRegion(), Random()
     search.reset(2, 5)
     random.reset(2, 5)
     np.testing.assert_array_equal(search.ask(1), random.ask(1))
     assert search.note() == {"engine": "scalar", "how": "initial", "why": "there is no prediction"}
-    check_search(TrustRegion())
-    check_search(Auto())
 
 
 def test_a_prediction_of_nothing_is_none() -> None:

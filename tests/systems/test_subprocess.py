@@ -258,7 +258,7 @@ def escaped(folder: Path, count: int = 1) -> list[int]:
 
 @pytest.mark.slow
 @LINUX
-@pytest.mark.parametrize("end", ["", "sys.exit(3)", "time.sleep(60)", "os.kill(os.getpid(), 9)"])
+@pytest.mark.parametrize("end", ["", "sys.exit(3)", *more("time.sleep(60)"), "os.kill(os.getpid(), 9)"])
 def test_what_left_the_group_ends_with_the_command(end: str, tmp_path: Path) -> None:
     with pytest.raises(ExecutionError, match=r"neither|status 3|not end within 1 s|SIGKILL"):
         python(tmp_path, ESCAPE + end, str(tmp_path), timeout=1).execute(designed(), TASK)

@@ -18,6 +18,7 @@ from ctxval.campaign.storage.store import Store
 from ctxval.core.trial import Trial
 from ctxval.web.security import HEADERS, MOST_UPLOAD
 from rig_page import Response, Server, ctxval, new_store, record, serving
+from rig_thorough import more
 
 pytestmark = pytest.mark.slow
 
@@ -214,11 +215,13 @@ def test_a_form_that_cannot_be_used_is_refused_in_place(
     [
         # Nothing of the file is in the sentence, because whoever sends a file may not learn what is in another one.
         (b"", {}, "run.csv: it is not a recording of this trial. The columns or fields t [s], position [m], speed"),
-        (b"a,b\n1,2\n3,4\n", {}, "position [m], speed [m/s], force [N] are needed, with a finite number for each time"),
-        (b"t,position,speed,force\n0,0,0,1\n0.1,0,x,1\n0.2,0,0,1\n", {}, "run.csv, line 3: it is not a recording"),
         (SHORT, {}, "must have 21 times"),
-        (b"\x00\xff\xfe", {}, "run.csv: it is not a recording of this trial"),
-        (b"t,position [ft],speed,force\n0,0,0,1\n0.1,0,0,1\n", {}, "position [m]"),
+        *more(  # in test_recording_process.py, too
+            (b"a,b\n1,2\n3,4\n", {}, "position [m], speed [m/s], force [N] are needed, with a finite number for each"),
+            (b"t,position,speed,force\n0,0,0,1\n0.1,0,x,1\n0.2,0,0,1\n", {}, "run.csv, line 3: it is not a recording"),
+            (b"\x00\xff\xfe", {}, "run.csv: it is not a recording of this trial"),
+            (b"t,position [ft],speed,force\n0,0,0,1\n0.1,0,0,1\n", {}, "position [m]"),
+        ),
         (
             b"t,position,speed,force\n0,0,0,1\n0.1,0,0,1\n",
             {"tolerance": "wide"},
@@ -251,7 +254,7 @@ def test_an_upload_that_leads_to_a_file_of_the_user_is_refused(
 
 
 @pytest.mark.parametrize(
-    "name", ["../../evil.csv", "..\\\\evil.csv", ".csv", "a" * 300 + ".csv", "<b>.csv", "x\x01.npz"]
+    "name", ["../../evil.csv", "a" * 300 + ".csv", "<b>.csv", "x\x01.npz", *more("..\\\\evil.csv", ".csv")]
 )
 def test_the_name_of_an_upload_leads_nowhere(server: Server, page: Response, name: str) -> None:
     answer = upload(server, 0, page, b"nothing", name)

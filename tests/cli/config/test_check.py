@@ -36,6 +36,7 @@ def test_every_case_is_checked() -> None:
     assert names == set(cases.NAMES) - {"pendulum-noisy"}  # its executions differ, as they should
 
 
+@pytest.mark.usefixtures("without_costs")
 @pytest.mark.parametrize(("error", "state"), [(1e-15, "ok"), (1e-9, "failed")])
 def test_a_task_of_a_batch_may_differ_by_rounding_alone(error: float, state: str) -> None:
     validation = make_validation()
@@ -49,6 +50,7 @@ def test_a_task_of_a_batch_may_differ_by_rounding_alone(error: float, state: str
     assert [finding.state for finding in found if finding.check == "batches"] == [state]
 
 
+@pytest.mark.usefixtures("without_costs")
 @pytest.mark.parametrize(("unit", "expected"), [((), True), (("m",), False)])
 def test_it_says_what_a_unit_of_length_is_good_for(unit: tuple[str, ...], expected: bool) -> None:
     validation = make_validation(horizon=5)

@@ -75,12 +75,13 @@ def test_the_file_of_init_reaches_a_verdict_as_it_is(invoke: Any, draws: str) ->
     assert again == report
 
 
-def test_the_file_of_init_passes_its_check(invoke: Any) -> None:
+def test_the_file_of_init_passes_its_check(invoke: Any, request: pytest.FixtureRequest) -> None:
     result = invoke("check", "experiment.toml", "--execute", "--json")
     assert result.exit_code == 0
     report = json.loads(result.stdout)
     assert report["ok"]
     assert {finding["state"] for finding in report["findings"]} == {"ok"}
+    request.getfixturevalue("without_costs")
     assert (
         "ok      execution: two executions of one task are the same"
         in invoke("check", "experiment.toml", "--execute").stdout
@@ -341,6 +342,7 @@ def plain() -> dict[str, tuple[str, str]]:
     return findings(make_validation())
 
 
+@pytest.mark.usefixtures("without_costs")
 @pytest.mark.parametrize(("iterations", "state"), [(1, "noted"), (100, "ok")])
 def test_a_check_counts_the_designs_that_did_not_converge(
     iterations: int, state: str, plain: dict[str, tuple[str, str]]
@@ -355,15 +357,17 @@ def test_a_check_counts_the_designs_that_did_not_converge(
     assert "convergence of the designs" not in plain
 
 
-def test_a_check_executes_nothing_unless_told() -> None:
+def test_a_check_executes_nothing_unless_told(request: pytest.FixtureRequest) -> None:
     rig = FaultyRig(make_validation().system, dict.fromkeys(range(9), "raise"))
     validation = make_validation(system=rig, horizon=5)
     assert findings(validation)["execution"][0] == "skipped"
     assert rig._executions == 0
+    request.getfixturevalue("without_costs")
     state, text = findings(validation, execute=True)["execution"]
     assert (state, "motor cut out" in text) == ("failed", True)
 
 
+@pytest.mark.usefixtures("without_costs")
 def test_noise_is_measured() -> None:
     rng = np.random.default_rng(0)
     plain = make_validation()
@@ -378,6 +382,7 @@ def test_noise_is_measured() -> None:
     assert "the system is stochastic" in text
 
 
+@pytest.mark.usefixtures("without_costs")
 @pytest.mark.parametrize(
     ("moved", "state", "sentence"),
     [(10.0, "failed", "the trajectory starts elsewhere: state 0 must start at"), (0.002, "ok", "are the same")],
@@ -397,6 +402,7 @@ def test_a_start_is_refused_if_campaigns_refuse_it(moved: float, state: str, sen
     assert any("start up to 0.002 away" in text for _, text in of_execution) == (state == "ok")
 
 
+@pytest.mark.usefixtures("without_costs")
 def test_a_model_whose_batches_differ_is_found() -> None:
     plain = make_validation()
 
@@ -417,6 +423,7 @@ def test_a_system_without_inputs_has_none_to_name(batched: bool) -> None:
     assert not [one for one in found if one.state == "failed"]
 
 
+@pytest.mark.usefixtures("without_costs")
 def test_dimensions_names_and_units_are_held_against_each_other(plain: dict[str, tuple[str, str]]) -> None:
     validation = make_validation(system=systems.Manual(states={"a": "m"}, inputs={"u": "N"}, dt=0.01), horizon=5)
     found = findings(validation, states=("angle",), inputs=("torque",))
@@ -429,6 +436,7 @@ def test_dimensions_names_and_units_are_held_against_each_other(plain: dict[str,
     assert plain["names"][0] == "noted"
 
 
+@pytest.mark.usefixtures("without_costs")
 def test_a_check_notes_a_distance_that_adds_different_units_and_how_to_weight_them() -> None:
     with pytest.warns(UnitsWarning, match=r"adds states in rad and rad/s without weights or scales"):
         experiment = Experiment("x", make_validation(horizon=5), states=("angle [rad]", "rate [rad/s]"))
@@ -437,6 +445,7 @@ def test_a_check_notes_a_distance_that_adds_different_units_and_how_to_weight_th
     assert "scales=[...], the size of an error of each state that counts as 1" in found[0].text
 
 
+@pytest.mark.usefixtures("without_costs")
 def test_a_controller_that_fails_on_the_model_itself_is_noted() -> None:
     state, text = findings(make_validation(horizon=3))["controller on the model"]
     assert state == "noted"

@@ -269,6 +269,7 @@ def test_what_a_file_names_is_sought_beside_it(here: Path) -> None:
     assert sys.path[0] == str(here / "one")
 
 
+@pytest.mark.usefixtures("without_costs")
 def test_the_file_of_init_is_checked_from_another_folder(here: Path) -> None:
     (here / "folder").mkdir()
     sys.modules.pop("experiment_system", None)

@@ -154,6 +154,7 @@ def test_the_grid_finds_a_distance_that_is_attained(experiment: Experiment) -> N
     assert experiment.truth is not None
 
 
+@pytest.mark.parametrize("experiment", ["linear", *more("gp", "fnn")], indirect=True)
 def test_a_campaign_runs_on_it(experiment: Experiment) -> None:
     campaign = Campaign(experiment.validation, search=searches.GPUCB(), seed=0).run(7)
     assert len(campaign.completed) == 7

@@ -147,7 +147,7 @@ def test_an_unknown_option_is_refused_with_the_nearest() -> None:
 @pytest.mark.slow
 def test_a_campaign_finds_the_worst_task_and_falsifies() -> None:
     case = linear.experiment(0, 2)
-    campaign = Campaign(case.validation).run(12, explore=True)
+    campaign = Campaign(case.validation).run(6, explore=True)
     assert campaign.estimate is not None
     assert 0.95 * true_worst(0, 2).distance <= campaign.estimate <= true_worst(0, 2).distance + 1e-10
     assert case.threshold == 0.5
