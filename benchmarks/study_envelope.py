@@ -30,15 +30,15 @@ from study_auto import RESULTS
 
 STORED = JsonLines(RESULTS / "envelope.jsonl", ("system", "seed", "rule"))
 PAGE = Path(__file__).parents[1] / "docs" / "envelope.md"
-RULE = 10
+RULE = 11
 """The version of the method: 1 had one margin for all tasks, 2 did not check its interpolation, 3 stated no envelope if
 learned dynamics missed the distance of a test, on whichever side of the threshold, 4 executed the tests before the
 model was falsified, which cost the verdict of oblique-wall, 5 learned contacts as noise, 6 asked for a regular part
 only if there seemed to be noise, or a test was not explained, 7 trusted runs to places that no execution had entered,
 so that only campaigns on systems with positions differ from 8, and the others have its number, 8 interpolated
-with one scale for all parameters, and with errors that further tasks could only enlarge, and 9 kept no executions for
-the tests of noisy systems until the model was falsified, so that only campaigns that lacked tests differ from 10."""
-LACKED = "predicted beforehand"  # in the doubt of a campaign that lacked tests
+with one scale for all parameters, and with errors that further tasks could only enlarge, 9 kept no executions for
+the tests of noisy systems until the model was falsified, so that only campaigns that lacked tests differ from 10, and
+10 interpolated what it trusts, of which smooth systems lost little."""
 COMPARABLE = 3  # later versions differ in what they do if learned dynamics miss a distance, and 4 in when it tests
 BUDGET, KEPT, CONFIDENCE = 15, 0.7, 0.95
 TASKS, NOISY_TASKS, REPEATS = 4000, 1000, 60
@@ -79,7 +79,8 @@ def study(system: str, seed: int) -> dict[str, Any]:
     campaign = Campaign(validation_of(system, seed), seed=seed)
     campaign.run(BUDGET, threshold, envelope=True, confidence=CONFIDENCE)
     envelope = campaign.envelope(threshold, CONFIDENCE)
-    trusted = envelope.trusted(points)
+    points, distances, kept = points[::2], distances[::2], kept[::2]  # closed loops of all would take minutes
+    trusted, interpolated = envelope.trusted(points), envelope.trusted(points, interpolated=True)
     false = trusted & ~kept
     return {
         "system": system,
@@ -91,6 +92,8 @@ def study(system: str, seed: int) -> dict[str, Any]:
         "executions": campaign.executions,
         "tests": envelope.tests,
         "found": float(trusted[kept].mean()),
+        "interpolated": float(interpolated[kept].mean()),
+        "interpolated_false": float((interpolated & ~kept).mean()),
         "false": float(false.mean()),
         "worst_false": float((distances[false] / threshold).max(initial=0.0)),
         "in_words": sum(region.share for region in envelope.regions[:1]),
@@ -124,12 +127,14 @@ oblique-wall and taut-tether, which have positions. Version 7 found 97, 79 and 6
 trusted. Version 9 interpolates better: its scales, columns, tasks at the boundary and errors were
 chosen on gripper-on-floor, moored-boat, rail-cars and corner-stop, after it was seen that the interpolation had lost
 most of what table-top and oblique-wall lacked. The last three contacts were added when the results of the others were
-known, and before their own were: no system of the reporting lists with contacts or backlash is left out. Version 10,
-the present one, keeps executions for the tests of noisy systems, too, after seven campaigns of version 9 had lacked one
-to three tests; these were run again, and no other would change.) Of each
+known, and before their own were: no system of the reporting lists with contacts or backlash is left out. Version 10
+keeps executions for the tests of noisy systems, too, after seven campaigns of version 9 had lacked one to three tests.
+Version 11, the present one, runs the closed loops of each task that it is asked about, with the same executions. It was
+chosen on gripper-on-floor, moored-boat and rail-cars, of which it finds 89, 81 and 95 % in place of 67, 51 and 95 %.
+Of smooth systems, whose interpolation loses little, the campaigns of versions 9 and 10 were not run again.) Of each
 system, 70 % of the tasks keep the threshold. "Found" is the share of these tasks that the envelope trusts; "false" is
 the share of all tasks that it trusts although their true distance is larger. True sets are known at {tasks} random
-tasks, of noisy systems at {noisy_tasks} tasks by {repeats} executions each.
+tasks, of noisy systems at {noisy_tasks} tasks by {repeats} executions each; version 11 was asked about half of them.
 [How to use an envelope](how-to/envelope.md) says what it is.
 
 **The median share found is {found:.0f} % over the systems, of which each counts once. The median of a system is at
@@ -140,7 +145,8 @@ stated.**
 
 {table}
 
-"Version" is the version of the method with which each campaign was run.
+"Version" is the version of the method with which each campaign was run. "Interpolated" is the share found if nothing is
+run, as by the function for planners; before version 11, this is also what was found.
 "Words" is the share of the tasks in the largest box that the envelope names. "False, at most" is the largest true
 distance of a falsely trusted task, divided by the threshold. Figures of systems are medians, except for the false ones,
 which are the largest.
@@ -157,9 +163,8 @@ def newest() -> list[dict[str, Any]]:
 
 
 def is_known(system: str, seed: int) -> bool:
-    """Return whether a campaign is stored, by the present rule or by the one before if it would do the same."""
-    before = STORED.select(system=system, seed=seed, rule=9)
-    return (system, seed, RULE) in STORED or any(LACKED not in (line["doubt"] or "") for line in before)
+    """Return whether a campaign is stored, by the present rule or, of a smooth system, by those before."""
+    return any((system, seed, rule) in STORED for rule in range(9 if system in SMOOTH else RULE, RULE + 1))
 
 
 def write_page(page: Path = PAGE) -> None:
@@ -168,8 +173,9 @@ def write_page(page: Path = PAGE) -> None:
     if not results:
         return
     rows = [
-        "| system | parameters | campaigns | version | executions | found | false | false, at most | words | CPU s |",
-        "|---" * 10 + "|",
+        "| system | parameters | campaigns | version | executions | found | false | false, at most | interpolated "
+        "| words | CPU s |",
+        "|---" * 11 + "|",
     ]
     medians = {}
     for system in SYSTEMS:
@@ -178,6 +184,7 @@ def write_page(page: Path = PAGE) -> None:
             continue
         kind = " (contact)" if system in CONTACTS else ""
         middle = {name: float(np.median([line[name] for line in lines])) for name in ("found", "in_words", "seconds")}
+        interpolated = float(np.median([line.get("interpolated", line["found"]) for line in lines]))
         medians[system] = middle["found"]
         executions = [line["executions"] for line in lines]
         worst = max(lines, key=lambda line: line["false"])
@@ -191,7 +198,8 @@ def write_page(page: Path = PAGE) -> None:
             f"{min(executions)} to {max(executions)}" if min(executions) < max(executions) else executions[0],
             f"{100 * middle['found']:.0f} %",
         ]
-        cells += [f"{100 * worst['false']:.1f} %", at_most, f"{100 * middle['in_words']:.0f} %"]
+        cells += [f"{100 * worst['false']:.1f} %", at_most, f"{100 * interpolated:.0f} %"]
+        cells.append(f"{100 * middle['in_words']:.0f} %")
         rows.append(f"| {' | '.join(map(str, [*cells, round(middle['seconds'])]))} |")
     false = np.array([line["false"] for line in results])
     reasons = [f"* {line['system']}, seed {line['seed']}: {line['doubt']}." for line in results if line["doubt"]]

@@ -247,15 +247,31 @@ def test_further_tasks_check_what_is_interpolated() -> None:
         return DrawnDistances(points, np.tile(heights, (40, 1)), *np.zeros((2, len(points))))
 
     others = np.random.default_rng(8).random((3000, 2))
+    tasks, true = SPACE.from_unit(others), waves(others).mean <= 0.6
     false = []
     for evaluate in (None, waves):
         known = envelope_of(SPACE, waves(POINTS), evidence_of(), [], 0.6, 0.95, evaluate, 200, "m")
         assert "stays below 0.6 m on all tasks" in known.statement
         assert ("no further task checks this" in known.statement) == (evaluate is None)
         assert (known.checks > 0) == (evaluate is not None)
-        false.append((np.isfinite(known.bound_at(others)) & (waves(others).mean > 0.6)).mean())
+        trusted = known.trusted(tasks, interpolated=True)
+        assert known.interpolated == pytest.approx(trusted.mean(), abs=0.03)
+        false.append((trusted & ~true).mean())
     assert false[0] > 0.01
     assert false[1] < 0.5 * false[0]
+    # The loops of tasks that are asked about are run: nothing between them is lost, or trusted falsely.
+    assert trusted[true].mean() < 0.7
+    assert (known.trusted(tasks) == (waves(others).upper(known.factor or 0, 0.6) <= 1)).all()
+    assert known.share == pytest.approx(known.trusted(tasks).mean(), abs=0.05)
+    assert not known.trusted([[2.1, 1.0], [0.0, -0.1]]).any()
+
+
+def test_draws_that_contradict_an_execution_are_asked_about_no_task() -> None:
+    executed = [(np.array([0.5, 0.3]), 0.9)]  # the draws have 0.3 there
+    known = envelope_of(SPACE, drawn_from(POINTS), evidence_of(), executed, 0.6, 0.95, drawn_from, 200)
+    assert not known.trusted(SPACE.from_unit(executed[0][0]))
+    assert known.trusted(SPACE.from_unit(np.array([0.5, 0.1])))
+    assert known.share == known.interpolated
 
 
 def test_tasks_whose_runs_come_to_places_that_no_execution_entered_are_not_trusted() -> None:

@@ -90,7 +90,6 @@ class EnvelopeSearch:
         executed = [(trial.unit_point, trial.least) for trial in known]
         # Further tasks check the interpolation between these; without batches, each costs a design of its own.
         checks = (256 if evidence.quantile is None else 64) if learned.study.planner.batched else 0
-        at = partial(self._at, learned) if checks else None
         try:
             if learned.split is not None:
                 evidence = self._left_out(learned, evidence)
@@ -103,6 +102,7 @@ class EnvelopeSearch:
                         doubt = f"trial {trial.number} failed beyond the threshold, and the learned dynamics keep it"
                         return withdrawn(space, threshold, confidence, f"{doubt}; record more executions near its task")
             drawn, irregular = self._drawn(learned, evidence), learned.split.irregular if learned.split else 0
+            at = partial(self._at, learned)
             return envelope_of(space, drawn, evidence, executed, threshold, confidence, at, checks, units, irregular)
         except Exception as error:  # users' parts, at states that no execution has reached
             return withdrawn(space, threshold, confidence, reason_of(error))

@@ -16,9 +16,11 @@ If a few recorded transitions are no smooth function of what is recorded, as tho
 the draws are learned from the others alone (:mod:`ctxval.learning.regular`), and a task is no part of the envelope if
 its run comes to states like those of the few. The tests are predicted from the executions of all other tasks.
 
-Between these tasks, ``mean + k spread`` is interpolated (:mod:`ctxval.certificates.envelope_shape`). The largest
-error of the nearest tasks, if each of them is interpolated from all others, is added. Further tasks of the set check
-this: errors are multiplied until hardly any of these tasks has ``mean + k spread`` above the threshold.
+Whether another task is trusted is known by its closed loops on the draws. Where these would take too long (boxes,
+pictures, and functions for planners), ``mean + k spread`` is interpolated between the tasks whose loops were run
+(:mod:`ctxval.certificates.envelope_shape`). The largest error of the nearest tasks, if each of them is interpolated
+from all others, is added. Further tasks of the set check this: errors are multiplied until hardly any of these tasks
+has ``mean + k spread`` above the threshold.
 """
 
 from __future__ import annotations
@@ -66,6 +68,8 @@ COUNTED = 4096  # tasks of which the share in the envelope is counted
 _EXCEEDED = 1.02  # an executed distance above the threshold counts as at least this multiple of it
 _SAME = 1e-9
 _SAME_TASK = 1e-6
+_OTHERS = 32  # tasks outside of the interpolated set that are counted if nothing checks this
+_BLOCK = 256  # tasks whose closed loops are run together
 _WORTH = 0.8  # share of the tasks predicted below the threshold that tests may leave in the envelope
 
 
@@ -78,7 +82,9 @@ class Envelope(ShortRepr):
     threshold: float
     confidence: float
     statement: str  #: what it says, in one sentence
-    share: float = 0.0  #: the share of the tasks that are trusted
+    #: share, interpolated: the share of the tasks that are trusted, and that boxes, pictures and saved functions trust
+    share: float = 0.0
+    interpolated: float = 0.0
     #: the largest boxes and half-spaces inside it, the largest first; not for a suite
     regions: tuple[TrustedRegion, ...] = ()
     tasks: tuple[str, ...] | None = None  #: the names of the trusted tasks of a suite; None if it is no suite
@@ -100,15 +106,17 @@ class Envelope(ShortRepr):
     units: str = ""  #: the units of the distance
     _surfaces: Surfaces | None = None
     _bounds: Array | None = None
+    _by_loops: Callable[[Array], Array] | None = None  # bounds of points (N, d), as shares of the threshold
 
-    def trusted(self, task: Mapping[str, Any] | ArrayLike) -> Any:
+    def trusted(self, task: Mapping[str, Any] | ArrayLike, *, interpolated: bool = False) -> Any:
         """Return whether tasks are trusted: of a mapping by name a bool, of points ``(..., d)`` of the space ``(...)``.
 
-        Tasks outside of the task space are not trusted.
+        Tasks outside of the task space are not trusted. Closed loops of the tasks are run on the draws. If
+        ``interpolated``, none are, which takes microseconds and trusts fewer tasks.
         """
-        return np.isfinite(self.bound(task))
+        return np.isfinite(self.bound(task, interpolated=interpolated))
 
-    def bound(self, task: Mapping[str, Any] | ArrayLike) -> Any:
+    def bound(self, task: Mapping[str, Any] | ArrayLike, *, interpolated: bool = False) -> Any:
         """Return bounds on the distances of trusted tasks, at most tau; infinity if a task is not trusted."""
         if isinstance(task, Mapping):
             points = self.space.point(task)
@@ -116,10 +124,14 @@ class Envelope(ShortRepr):
             points = require_shape("task", as_floats("task", task), (self.space.dimension,))
         unit = self.space.to_unit(points)
         inside = np.asarray(((unit >= -_SAME) & (unit <= 1 + _SAME)).all(axis=-1))
-        return np.where(inside, self.bound_at(np.clip(unit, 0, 1)), np.inf)[()]
+        if interpolated or self._by_loops is None:
+            return np.where(inside, self.bound_at(np.clip(unit, 0, 1)), np.inf)[()]
+        bounds = np.full(inside.shape, np.inf)
+        bounds[inside] = self.threshold * self._by_loops(np.clip(unit[inside], 0, 1))
+        return bounds[()]
 
     def bound_at(self, unit: Array) -> Array:
-        """Return :meth:`bound` at points ``(..., d)`` of the unit cube."""
+        """Return the interpolated :meth:`bound` at points ``(..., d)`` of the unit cube."""
         if self._bounds is not None and isinstance(self.space, TaskSuite):
             rows = self.space.rows_at(unit)
             same = np.abs(self.space.members[rows] - unit).max(axis=-1) <= _SAME
@@ -144,8 +156,8 @@ class Envelope(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return the statement and its numbers, ready for JSON."""
-        first = "threshold confidence units statement words share regions tasks factor raised_by margin evaluated"
-        names = f"{first} checks uncovered executions tests quantile assumptions irregular doubt".split()
+        first = "threshold confidence units statement words share interpolated regions tasks factor raised_by margin"
+        names = f"{first} evaluated checks uncovered executions tests quantile assumptions irregular doubt".split()
         plain = {name: getattr(self, name) for name in names}
         lists = {name: list(value) for name, value in plain.items() if isinstance(value, tuple)}
         lists["regions"] = [region.to_json() for region in self.regions]
@@ -154,10 +166,10 @@ class Envelope(ShortRepr):
         }
 
     def save(self, path: str | Path) -> Path:
-        """Write the function ``trusted(task) -> bool, bound`` to a file ``.py``, which needs NumPy alone, or ``.onnx``.
+        """Write the interpolated function ``trusted(task) -> bool, bound`` to a file ``.py`` or ``.onnx``.
 
-        An ONNX file, which the package onnx writes (extra ``fit``), has the input ``task`` ``(N, d)`` and the outputs
-        ``trusted`` and ``bound`` ``(N,)``.
+        A Python file needs NumPy alone. An ONNX file, which the package onnx writes (extra ``fit``), has the input
+        ``task`` ``(N, d)`` and the outputs ``trusted`` and ``bound`` ``(N,)``.
 
         Raises:
             InputError: if the path has another suffix, nothing is trusted, or the task space is a suite.
@@ -292,8 +304,8 @@ def envelope_of(
 
     Args:
         executed: points of the unit cube ``(d,)`` with their distances.
-        evaluate: returns the distances of further tasks on the same draws; None if the interpolation is not checked.
-        checks: the number of these tasks.
+        evaluate: returns the distances of further tasks on the same draws; None if all other tasks are interpolated.
+        checks: the number of further tasks that check the interpolation.
         irregular: the number of recorded steps that the draws are not learned from.
     """
     factor, raised_by = _raised(drawn, evidence, threshold, confidence)
@@ -329,9 +341,43 @@ def envelope_of(
         tasks = space.unit_draws(COUNTED, np.random.default_rng(0))
         inside = np.isfinite(envelope.bound_at(tasks))
         regions = regions_inside(space, tasks, inside, lambda unit: np.isfinite(envelope.bound_at(unit)))
+        share = float(inside.mean())
         uncovered = float(((surfaces(tasks)[:, 0] <= 1) & ~inside).mean())
-        envelope = replace(envelope, share=float(inside.mean()), regions=regions, uncovered=uncovered)
+        envelope = replace(envelope, share=share, interpolated=share, regions=regions, uncovered=uncovered)
+        if evaluate is not None:
+            others = tasks[~inside][: checks // 2 or _OTHERS]
+            envelope = _with_loops(envelope, evaluate, most_beyond(evidence), executed, others)
     return replace(envelope, statement=envelope_statement(envelope))
+
+
+def _with_loops(
+    envelope: Envelope,
+    evaluate: Callable[[Array], DrawnDistances],
+    most: float,
+    executed: Sequence[tuple[Array, float]],
+    others: Array,
+) -> Envelope:
+    """Return the envelope that runs the closed loops of tasks, with the shares of others ``(N, d)`` that it adds."""
+    factor, threshold = envelope.factor or 0.0, envelope.threshold
+    exceeding = [point for point, distance in executed if distance > threshold and envelope.quantile is None]
+
+    def by_loops(points: Array) -> Array:
+        blocks = [np.zeros(0)]
+        for first in range(0, len(points), _BLOCK):
+            drawn = evaluate(points[first : first + _BLOCK])
+            upper = drawn.upper(factor, threshold)
+            blocks.append(np.where((upper <= 1) & (drawn.leaving(most) <= 1), np.maximum(upper, 0), np.inf))
+        return np.concatenate(blocks)
+
+    if exceeding and np.isfinite(by_loops(np.array(exceeding))).any():
+        return envelope  # the draws contradict an execution, and the interpolation keeps away from it
+    envelope = replace(envelope, _by_loops=by_loops)
+    if not len(others):
+        return envelope
+    drawn, left = evaluate(others), 1 - envelope.interpolated
+    below, covered = drawn.upper(factor, threshold) <= 1, drawn.leaving(most) <= 1
+    share = envelope.interpolated + left * float((below & covered).mean())
+    return replace(envelope, share=share, uncovered=left * float((below & ~covered).mean()))
 
 
 def _of_suite(

@@ -17,7 +17,7 @@ from ctxval.core.labels import labels_of
 from ctxval.core.learned_numbers import PushedDistances
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
-from ctxval.learning.closed_loops import AnyPosterior, distances_of, loop_pairs
+from ctxval.learning.closed_loops import AnyPosterior, Loops, distances_of, loop_pairs
 from ctxval.learning.coverage import (
     away_from_executions,
     beyond_records,
@@ -159,8 +159,7 @@ class LearnedDynamics(ShortRepr):
                 many = drawn.settled(rng) if settled else None
                 self._draws[key] = drawn if many is None else many
             values = planner.distances(self._draws[key], planned, len(points))
-            silent = self.drawn_from.mean.without_noise()
-            of_pool, loops = planner.run(silent, search.plans), planner.run(silent, planned)
+            of_pool, loops = self._pool_loops, planner.run(self.drawn_from.mean.without_noise(), planned)
             beyond, away, crossed = np.full(len(points), np.inf), np.zeros(len(points)), np.ones(len(points))
             boundary = self.boundary
             all_beyond = beyond_records(self.posterior, of_pool, loops, executed_only=boundary is not None)
@@ -294,12 +293,16 @@ class LearnedDynamics(ShortRepr):
         return self._on_pool[1]
 
     @functools.cached_property
+    def _pool_loops(self) -> list[Loops]:
+        """The closed loops of the pool's tasks on the posterior mean, without noise."""
+        return self.study.planner.run(self.drawn_from.mean.without_noise(), self.study.search.plans)
+
+    @functools.cached_property
     def _on_pool(self) -> tuple[Array, StateInputCoverage]:
         """The distances of the pool's tasks on the posterior mean, and the coverage of their closed loops."""
         search, planner = self.study.search, self.study.planner
         with single_threaded():
-            searched = self.drawn_from.mean.searched
-            loops = planner.run(self.drawn_from.mean.without_noise(), search.plans)
+            searched, loops = self.drawn_from.mean.searched, self._pool_loops
             noisy = loops if searched.replicates == 1 else planner.run(searched, search.plans)
             (distances,) = distances_of(searched, noisy, search.plans, len(search.pool))
             return distances, coverage(self.posterior, search.pool, search.plans, loops, self.labels)

@@ -302,7 +302,7 @@ def envelope_statement(envelope: Envelope) -> str:
     """Return what an envelope says, why it is not larger, and what nothing has checked."""
     limit = f"{at_most(envelope.threshold)} {envelope.units}".rstrip()
     what = "d" if envelope.quantile is None else f"the {envelope.quantile:g} quantile of d"
-    size = f"{100 * envelope.share:.3g} % of the tasks" if envelope.tasks is None else f"{len(envelope.tasks)} tasks"
+    size = f"{100 * envelope.share:.2g} % of the tasks" if envelope.tasks is None else f"{len(envelope.tasks)} tasks"
     tasks = f"all tasks of a set of {size}" if envelope.share else "no task that can be named"
     sentences = [f"With {percent(envelope.confidence)} confidence, {what} stays below {limit} on {tasks}."]
     or_irregular = " or come to contacts" if envelope.irregular else ""
@@ -319,7 +319,7 @@ def envelope_statement(envelope: Envelope) -> str:
         )
     if envelope.share and envelope.tasks is None and not envelope.checks:
         sentences.append(
-            f"Between the {envelope.evaluated} tasks whose closed loops were run, it is interpolated, and no further "
-            "task checks this, because the planner designs one task at a time."
+            f"Boxes, pictures and saved functions are interpolated between {envelope.evaluated} tasks whose closed "
+            "loops were run, and no further task checks this, because the planner designs one task at a time."
         )
     return " ".join(sentences)
