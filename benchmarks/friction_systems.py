@@ -18,6 +18,8 @@ REGULAR = ("cart-pole", "gantry", "scara", "harmonic-drive", "xy-table")
 """Others whose friction is of a kind that is learned."""
 OTHERS = ("worn-guide", "two-way-ratchet")
 """Others whose friction changes with the place or the direction."""
+AT_REST = ("cylinder", "rotary-seal", "sealed-table")
+"""Others whose friction is larger at rest than at any rate, which only the smallest moves show."""
 
 Push = Callable[[Array, Array, Array], Array]
 """The accelerations ``(..., k)`` at positions, speeds and inputs."""
@@ -41,7 +43,7 @@ def coulomb(speed: Array, slow: float = 0.002) -> Array:
 
 
 def pair(
-    name: str, units: str, space: TaskSpace, system: Push, model: Push, horizon: int, dt: float,
+    name: str, units: str, space: TaskSpace, system: Push | models.Function, model: Push, horizon: int, dt: float,
     Q: list[float], R: float, compared: tuple[int, ...], inputs: int = 1, substeps: int = 100,
 ) -> Experiment:  # fmt: skip
     """Return an experiment whose tasks begin at rest at ``start`` and end at ``goal``; other places are 0."""
@@ -58,7 +60,7 @@ def pair(
         units,
         space=space,
         task=task,
-        system=systems.Simulated(mechanism(system, dt, substeps)),
+        system=systems.Simulated(system if isinstance(system, models.Function) else mechanism(system, dt, substeps)),
         model=mechanism(model, dt),
         synthesizer=controllers.LQR(Q, [R] * inputs),
         distance=distances.MaximumDeviation(components=compared),
@@ -146,6 +148,20 @@ def loaded_gear(share: float, friction: float) -> Push:
     return lambda q, w, u: u - 0.5 * w - (friction + share * np.abs(u)) * coulomb(w)
 
 
+def sealed(push: Push, sliding: Array, rest: Array, dt: float, substeps: int = 40) -> models.Function:
+    """Return joints that rest until a force overcomes more than they slide with; push is without friction."""
+
+    def step(x: Array, u: Array) -> Array:
+        k, h = x.shape[-1] // 2, dt / substeps
+        places, speeds = x[..., :k], x[..., k:]
+        free = speeds + h * push(places, speeds, u)
+        grips = np.where(speeds == 0, rest, sliding)
+        speeds = np.sign(free) * np.maximum(np.abs(free) - h * grips, 0.0)
+        return np.concatenate([places + h * speeds, speeds], axis=-1)
+
+    return models.Function(repeated(step, substeps), vectorized=True)
+
+
 def arm_xml(friction: tuple[float, float]) -> str:
     """Return an arm of MuJoCo with two joints, with dry friction or without."""
     joint = '<joint name="{}" axis="0 0 1" damping="{}" frictionloss="{}"/>'
@@ -175,6 +191,20 @@ def frictionloss_arm() -> Experiment:
 
 def _moves(unit: str, start: float, goal: float, *, of: str = "") -> dict[str, tuple[float, float, str]]:
     return {f"start{of}": (-start, start, unit), f"goal{of}": (-goal, goal, unit)}
+
+
+def with_seals(
+    name: str, units: str, space: TaskSpace, push: Push, sliding: object, rest: object,
+    Q: list[float], R: float, inputs: int = 1,
+) -> Experiment:  # fmt: skip
+    """Return an experiment with friction that is larger at rest, which M lacks, and joints 5 % heavier than in M."""
+
+    def heavier(q: Array, w: Array, u: Array) -> Array:
+        return push(q, w, u) / 1.05
+
+    dt, places = 0.04, tuple(range(inputs))
+    joints = sealed(heavier, np.asarray(sliding), np.asarray(rest), dt)
+    return pair(name, units, space, joints, push, 60, dt, Q, R, places, inputs)
 
 
 def axis(name: str, push: Callable[[float, float], Push], *sizes: float) -> Experiment:
@@ -213,4 +243,15 @@ SYSTEMS: dict[str, Callable[[], Experiment]] = {
     "worn-guide": lambda: axis("worn-guide", worn_guide, 1.2, 0.4),
     "loaded-gear": lambda: axis("loaded-gear", loaded_gear, 0.15, 0.2),
     "two-way-ratchet": lambda: axis("two-way-ratchet", two_way_ratchet, 0.7, 0.4),
+    "cylinder": lambda: with_seals(
+        "cylinder", "m", TaskSpace(**_moves("m", 1.0, 1.5)), ball_screw(0.0, 0.0), 0.5, 0.8, [12.0, 1.0], 0.6,
+    ),
+    "rotary-seal": lambda: with_seals(
+        "rotary-seal", "rad", TaskSpace(**_moves("rad", 0.8, 1.2)),
+        geared_pendulum(1.0, 0.0), 0.4, 0.7, [25.0, 3.0], 0.2,
+    ),
+    "sealed-table": lambda: with_seals(
+        "sealed-table", "m", TaskSpace(**_moves("m", 0.4, 0.8, of="_x"), **_moves("m", 0.4, 0.8, of="_y")),
+        xy_table(1.5, (0.0, 0.0, 0.0)), [0.5, 0.3], [0.7, 0.45], [20.0, 20.0, 2.0, 2.0], 0.2, 2,
+    ),
 }  # fmt: skip

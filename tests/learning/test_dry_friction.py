@@ -25,13 +25,15 @@ MODEL = models.Linear(np.array([[1.0, DT], [0.0, 1.0]]), np.array([[0.0], [DT]])
 JOINTS = models.Linear(np.eye(2), DT * np.linalg.inv(MASS))  # rates of two joints on which torques act
 
 
-def sticky_step(x: Array, u: Array, grip: float = GRIP, excess: float = 0.0, load: float = 0.0) -> Array:
+def sticky_step(
+    x: Array, u: Array, grip: float = GRIP, excess: float = 0.0, load: float = 0.0, slow: float = SLOW
+) -> Array:
     """A cart with drag and dry friction, of 40 short steps, so that it may stop within a step."""
     position, speed = x[..., 0], x[..., 1]
     dt = DT / 40
     for _ in range(40):
         free = speed + dt * (u[..., 0] - 0.3 * speed)
-        most = grip + load * np.abs(u[..., 0]) + excess * np.exp(-((speed / SLOW) ** 2))
+        most = grip + load * np.abs(u[..., 0]) + excess * np.exp(-((speed / slow) ** 2))
         speed = np.sign(free) * np.maximum(np.abs(free) - dt * most, 0.0)
         position = position + dt * speed
     return np.stack([position, speed], axis=-1)
@@ -39,7 +41,8 @@ def sticky_step(x: Array, u: Array, grip: float = GRIP, excess: float = 0.0, loa
 
 def rubbing(model: models.Linear, rates: list[int], sliding: Array) -> DryFriction:
     m = len(rates)
-    return DryFriction(model, np.array(rates), sliding, *np.zeros((2, m)), np.ones(m), np.zeros(m), np.full(m, 1e-3))
+    sizes = sliding, *np.zeros((2, m)), np.ones(m), np.zeros(m), np.full(m, 1e-3), np.zeros(m)
+    return DryFriction(model, np.array(rates), *sizes, rest=sliding, passed=np.full(m, np.inf))
 
 
 def recorded(step: Any, count: int = 300, inputs: int = 1) -> Transitions:
@@ -55,6 +58,28 @@ def test_friction_slows_a_rate_and_never_turns_it(speed: float, push: float, gri
     free = speed + DT * push
     after = held.step(np.array([0.0, speed]), np.array([push]))[1]
     assert after == pytest.approx(np.sign(free) * max(abs(free) - DT * grip, 0.0), abs=1e-9)
+
+
+def test_what_holds_a_joint_at_rest_is_bounded_by_what_it_withstood_and_what_set_it_in_motion() -> None:
+    step = partial(sticky_step, excess=0.4, slow=1e-3)  # holds up to 1.2, and slides with 0.8
+    moving, still = recorded(step), np.zeros((4, 2))
+    u = np.array([[0.5], [-1.1], [-1.3], [2.0]])
+    moving = moving[moving.x[:, 1] != 0]
+    x, inputs = np.concatenate([moving.x, still]), np.concatenate([moving.u, u])
+    known = rubbing(MODEL, [1], np.array([GRIP]))
+
+    def missed(acting: Array) -> Array:
+        return sticky_step(x, acting, 0.0) - MODEL.step(x, acting)
+
+    transitions = Transitions(x, inputs, step(x, inputs))
+    least, largest, passed = known.resting(transitions, missed)
+    assert least[0] == pytest.approx(1.1, abs=0.01)
+    assert largest[0] == pytest.approx(1.3, abs=0.02)
+    assert passed[0] > GRIP
+    held = replace(known, rest=np.array([1.2]))
+    np.testing.assert_allclose(held.following(still, u, lambda acting: 0 * still)[:2], 0.0, atol=1e-12)
+    slid = DT * np.sign(u[2:, 0]) * (np.abs(u[2:, 0]) - GRIP)
+    np.testing.assert_allclose(held.step(still, u)[2:, 1], slid, atol=1e-9)
 
 
 @given(st.lists(st.floats(-3, 3), min_size=4, max_size=4), st.floats(0, 5), st.floats(0, 5))
@@ -179,7 +204,7 @@ def cart(step: Any = sticky_step) -> Validation:
     [
         (4, {}, {"u[0]": GRIP}),
         *more(
-            (6, {"excess": 0.4}, {"u[0]": GRIP, "u[0] at rest": 1.2}),
+            (6, {"excess": 0.4}, {"u[0]": GRIP}),
             (6, {"grip": 0.2, "load": 0.2}, {"u[0]": 0.2, "share of u[0]": 0.2}),  # joints are also braked
         ),
     ],
@@ -194,7 +219,7 @@ def test_runs_that_stop_short_are_predicted_from_few_executions(
     executed = [(point, run.system_trajectory) for point, run in zip(points[:count], runs, strict=False)]
     learned = DynamicsStudy(validation).learn(executed)
     assert learned is not None
-    assert learned.friction == pytest.approx(friction, rel=0.1)
+    assert {name: learned.friction.get(name) for name in friction} == pytest.approx(friction, rel=0.1)
     assert learned.noisy is None  # what friction does within a step is no history
     expected, distances_ = learned.expected(points[count:]), [run.distance for run in runs[count:]]
     np.testing.assert_allclose(expected, distances_, rtol=0, atol=0.05 * max(distances_))
@@ -210,7 +235,19 @@ def test_friction_is_found_in_records_with_noise() -> None:
         executed.append((point, replace(loop, states=loop.states + 0.01 * rng.normal(size=loop.states.shape))))
     learned = DynamicsStudy(validation, quantile=0.9).learn(executed)
     assert learned is not None
-    assert learned.friction == {"u[0]": pytest.approx(GRIP, rel=0.1)}
+    assert learned.friction["u[0]"] == pytest.approx(GRIP, rel=0.1)
+    assert learned.friction["u[0] at rest at most"] > GRIP
+
+
+@pytest.mark.slow
+def test_friction_that_only_rest_shows_is_not_validated_falsely() -> None:
+    """Seals and guides hold with more than they slide with, in few tasks: a random one would hardly show it."""
+    validation = cart(partial(sticky_step, grip=0.4, excess=0.2, slow=1e-3))
+    tasks = validation.space.iid(4000, np.random.default_rng(1))
+    distances_ = np.asarray(validation.distances(tasks))
+    threshold = 0.95 * float(distances_.max())
+    assert (distances_ > threshold).mean() < 0.02
+    assert Campaign(validation, seed=0).run(20, threshold).verdict(threshold).answer != "validated"
 
 
 @pytest.mark.parametrize("seed", more(0, 1, 2))

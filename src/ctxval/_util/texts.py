@@ -101,6 +101,7 @@ def aligned(rows: Sequence[Sequence[str]], *, right: bool = False) -> str:
 
 def parted(label: str) -> tuple[str, str]:
     """Return the name and the unit of ``name [unit]``; ``x[1]`` is a name, as FMUs have them, and has no unit."""
-    name, bracket, unit = label.strip().rpartition("[")
-    unit = unit.removesuffix("]").strip()
-    return (name.strip(), unit) if bracket and not unit.isdigit() else (label.strip(), "")
+    label = label.strip()
+    name, bracket, unit = label.removesuffix("]").rpartition("[")
+    is_unit = bracket and label.endswith("]") and not unit.strip().isdigit()
+    return (name.strip(), unit.strip()) if is_unit else (label, "")

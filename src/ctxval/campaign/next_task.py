@@ -62,6 +62,10 @@ def next_task(
     order = np.argsort(evidence.maxima, kind="stable")
     rank = evidence.rank(confidence)
     highest = evidence.points[[*order[rank::-1], *order[:rank:-1]]]
+    if (
+        evidence.friction
+    ):  # one execution at the least friction at rest that exceeds the limit rules out all larger ones
+        highest = evidence.points[np.argsort(np.where(evidence.maxima > limit, evidence.maxima, np.inf), kind="stable")]
     farthest, largest = evidence.coverage.task[None], evidence.elites
     exceeds = evidence.upper(confidence) > limit
     if exceeds and len(known) % 3 == 2:  # every third execution leads farthest from the records in any case

@@ -95,7 +95,7 @@ class DynamicsEvidence(ShortRepr):
     quantile: float | None = None  #: share of the executions of a task that are below the maxima; None without noise
     lags: int = 0  #: number of earlier records and inputs that the learned dynamics depend on
     actuator: tuple[float, float] | None = None  #: delay and time constant of inputs in steps; None if they act at once
-    #: the dry friction at each input, by its label, that at rest if it is larger, and its share of the input if it
+    #: the dry friction at each input, by its label, the most at rest if that is more, and its share of the input if it
     #: grows with it; empty if what M misses is smooth
     friction: Mapping[str, float] = field(default_factory=dict)
     pocket: StatePocket | None = None  #: the largest region that no execution has entered; None if it is not known

@@ -103,7 +103,8 @@ class DynamicsDraws(DrawsWithoutNoise):
         firsts = np.cumsum([0, *(len(each.weights) for each in self.expansions)])
         chosen = [rows[(rows >= first) & (rows < last)] - first for first, last in pairwise(firsts)]
         kept = tuple(each[some] for each, some in zip(self.expansions, chosen, strict=True) if len(some))
-        return replace(self, expansions=kept)
+        model = self.model[rows] if isinstance(self.model, DryFriction) else self.model
+        return replace(self, expansions=kept, model=model)
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next states; see :class:`DrawsWithoutNoise`."""
@@ -113,12 +114,12 @@ class DynamicsDraws(DrawsWithoutNoise):
         acting = u[..., : self.data.inputs]
         with np.errstate(all="ignore"):
             if isinstance(self.model, DryFriction):
-                following = self.model.following(x, acting, lambda inputs: self._residuals(x, inputs))
+                following = self.model.following(x, acting, lambda inputs: self.residuals(x, inputs))
             else:
-                following = self.model.step(x, acting) + self._residuals(x, acting)
+                following = self.model.step(x, acting) + self.residuals(x, acting)
             return following.reshape(shape)
 
-    def _residuals(self, x: Array, u: Array) -> Array:
+    def residuals(self, x: Array, u: Array) -> Array:
         """Return the residuals ``(S, q, n)`` at states ``(S, q, n)`` and acting inputs ``(S, q, m)``."""
         z = bounded(self.data.standardised(x, u))
         parts = np.split(z, np.cumsum([len(each.weights) for each in self.expansions[:-1]], dtype=int))

@@ -4,20 +4,23 @@ Its force changes by a jump where a joint stops or turns, so it is no smooth fun
 recorded runs do not teach it to a Gaussian process. Here it is a part of the inputs, as in the time stepping of Moreau
 (1988): the inputs ``u - f`` act, with ``|f_j| <= c_j``, where f_j brings the rate that input j drives to rest if it
 can, and opposes it as strongly as it can otherwise. The limit c_j may grow with the input, as that of a gear does, and
-may be larger at rest than in motion (Stribeck 1902). What M misses is a smooth function of the state and the inputs
+may be larger at low rates (Stribeck 1902). What M misses is a smooth function of the state and the inputs
 that act. It is learned of steps in which all these rates move, because f is known there.
+
+What holds a joint at rest may be larger than what any motion shows, as that of seals and guides. Steps at rest bound
+it: it is at least the largest force that a joint withstood, and less than the smallest one that set a joint in motion.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import nnls
 from scipy.special import erf
 
-from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.arrays import Array, ArrayLike, Mask, Rows
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.models.increments import standard_deviations
@@ -26,9 +29,13 @@ _TIMES = 2  # the residual is evaluated at forces that follow from it
 _SWEEPS = 4  # each time, of the inputs, whose frictions act on each other's rates
 _EXPLAINED = 0.7  # share of the squared residuals, beside a linear function, that must be left at most
 _REST = 0.05  # share of the root mean square of a rate below which the joint is at rest
+_STILL = 0.2 * _REST  # the same, of a joint that is held; one that stops is faster
+_ERRORS = 3.0  # median errors of forces by which the bounds of what holds a joint are apart from what was seen
 _PER_COEFFICIENT = 5  # fewest recorded steps for each coefficient of the linear function
 _SLOW = np.geomspace(_REST, 0.25, 11)  # rates up to which friction is larger, as shares like _REST
 _KNOWN = 0.1  # least share of the squares of inputs that no linear function of the state has, to know what inputs do
+_LITTLE = 0.05  # share of a force up to which it counts as withstood
+_NEWTON = 4  # steps to the forces that recorded steps had
 _SLIPS = 3  # times that the friction of a joint that slips follows from its rate
 _LARGER = 0.5  # share of the squared residuals that must be left at most if friction has one more shape
 
@@ -45,6 +52,13 @@ class DryFriction:
     slow: Array  # the rate at which the excess has fallen to 37 % (m,)
     creep: Array  # the rate at which a held joint creeps under a unit of its input (m,)
     change: Array  # by which inputs are changed to see what they do (m,)
+    still: Array  # the largest rate of a joint at rest (m,)
+    rest: Array  # the largest friction at rest if no input acts (m,), or of draws (S, 1, m)
+    passed: Array  # the largest friction that holds a joint as it turns (m,)
+
+    def __getitem__(self, rows: ArrayLike) -> DryFriction:
+        """Return the frictions of some draws."""
+        return replace(self, rest=self.rest[np.asarray(rows)])
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
@@ -70,19 +84,64 @@ class DryFriction:
                 own, limit = of_rates[..., j, j], at_first[..., j]
                 rate = reached[..., self.rates[j]] - (of_rates[..., j, :] * force).sum(axis=-1)
                 free = rate + own * force[..., j]
-                holding = np.nan_to_num(free / (own + np.sign(own) * self.creep[j]))
+                stopping = np.nan_to_num(free / (own + np.sign(own) * self.creep[j]))
                 if self.excess[j]:
-                    slips, after = np.abs(holding) > limit, before.copy()
+                    slips, after = np.abs(stopping) > limit, before.copy()
                     for _ in range(_SLIPS):
-                        after[..., j] = free - own * np.clip(holding, -limit, limit)
+                        after[..., j] = free - own * np.clip(stopping, -limit, limit)
                         limit = np.where(slips, self._limits(u, before, after)[..., j], limit)
-                force[..., j] = np.clip(holding, -limit, limit)
+                # A joint at rest, or one that turns, is held if friction withstands what acts on it then.
+                rests = np.abs(before[..., j]) <= self.still[j]
+                turns = (free - own * np.clip(stopping, -limit, limit)) * before[..., j] <= 0
+                most = np.where(rests, self.rest[..., j], np.minimum(self.rest[..., j], self.passed[j]))
+                withstood = np.abs(np.nan_to_num((free - before[..., j]) / own)) - self.load[j] * np.abs(u[..., j])
+                held = (rests | turns) & (withstood <= most)
+                force[..., j] = np.where(held, stopping, np.clip(stopping, -limit, limit))
         return force
 
     def _limits(self, u: Array, before: Array, after: Array) -> Array:
         """Return the largest friction in steps with these inputs and between these rates; shapes ``(..., m)``."""
         largest = self.sliding + self.load * np.abs(u)
         return largest + self.excess * _slowness(before, after, self.slow) if self.excess.any() else largest
+
+    def resting(self, transitions: Transitions, missed: Callable[[Array], Array]) -> tuple[Array, Array, Array]:
+        """Return the least and the largest friction at rest, and that of turning joints, that transitions permit.
+
+        Each has the shape ``(m,)``. M misses ``missed(acting inputs)``. Friction that depends on the place or on the
+        time at rest holds at one force and not at a smaller one: then only larger forces that set a joint in motion
+        count.
+        """
+        x, u, m = transitions.x, transitions.u, len(self.rates)
+        before, after = x[:, self.rates], transitions.x_next[:, self.rates]
+        reached, effects = _reached(self.model, x, u, self.change)
+        of_rates, force = effects[:, self.rates, :], np.zeros_like(u)
+        inverse = np.linalg.pinv(of_rates)
+
+        def rates_with(forces: Array) -> Array:
+            return np.asarray((reached + missed(u - forces))[:, self.rates] - (of_rates * forces[:, None]).sum(axis=2))
+
+        for _ in range(_NEWTON):  # the frictions that these steps had
+            force += (inverse * (rates_with(force) - after)[:, None]).sum(axis=2)
+        moves = _directions(transitions, self.rates)
+        errors = np.abs(force - self._limits(u, before, after) * moves)[(moves != 0).all(axis=1)]
+        usual = _ERRORS * np.median(errors, axis=0)
+        least, largest, passed = self.sliding.copy(), np.abs(u).max(axis=0), np.full(m, np.inf)
+        for j in range(m):
+            holding = force.copy()  # what would have kept this joint at its rate
+            holding[:, j] += (after - before)[:, j] / of_rates[:, j, j]
+            for _ in range(_NEWTON):
+                holding[:, j] += (rates_with(holding) - before)[:, j] / of_rates[:, j, j]
+            withstood = np.abs(holding[:, j]) - self.load[j] * np.abs(u[:, j])
+            own, accelerated = np.abs(of_rates[:, j, j]), np.abs(holding - force)[:, j]
+            little = np.maximum(usual[j], _LITTLE * withstood)
+            rests = np.abs(before[:, j]) <= little * own
+            most = float(withstood[rests & (accelerated <= little)].max(initial=0.0))
+            least[j] = max(self.sliding[j], most - usual[j])
+            started = rests & (accelerated > 2 * little) & (withstood > most)
+            largest[j] = max(least[j], withstood[started].min(initial=largest[j]) + usual[j])
+            turned = ((before * after)[:, j] < 0) & (np.minimum(np.abs(before), np.abs(after))[:, j] > little * own)
+            passed[j] = withstood[turned].min(initial=np.inf) + usual[j]
+        return least, largest, passed
 
     def acting(self, transitions: Transitions) -> tuple[Transitions, Mask]:
         """Return transitions with the inputs that act, and of which the friction is known ``(N,)``: all joints move."""
@@ -154,8 +213,20 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
     if falls := slowed[slow][0] ** 2 < _LARGER * left_over**2:
         largest = slowed[slow][1]
     load, excess = largest[1] if grows else np.zeros(m), largest[-1] if falls else np.zeros(m)
-    creep = _creep(transitions, reached, effects, rates)
-    return DryFriction(model, rates, largest[0], load, excess, slow * usual, creep, 1e-3 * ranges)
+    still = _STILL * usual
+    return DryFriction(
+        model,
+        rates,
+        largest[0],
+        load,
+        excess,
+        slow * usual,
+        _creep(transitions, reached, effects, rates, still),
+        1e-3 * ranges,
+        still,
+        rest=largest[0] + excess,
+        passed=np.full(m, np.inf),
+    )
 
 
 def _beside(basis: Array, values: Array) -> Array:
@@ -172,10 +243,9 @@ def _slowness(before: Array, after: Array, slow: Array) -> Array:
     return np.where(same, np.exp(-(first**2)), mean)
 
 
-def _creep(transitions: Transitions, reached: Array, effects: Array, rates: Rows) -> Array:
+def _creep(transitions: Transitions, reached: Array, effects: Array, rates: Rows, still: Array) -> Array:
     """Return the rates of joints that stay at rest per unit of what holds them ``(m,)``, by least squares."""
     before, after = transitions.x[:, rates], transitions.x_next[:, rates]
-    still = 0.2 * _REST * np.sqrt((after**2).mean(axis=0))  # a joint that stops is faster
     held = (np.abs(before) <= still) & (np.abs(after) <= still)
     force = (np.linalg.pinv(effects[:, rates]) @ (reached[:, rates] - after)[:, :, None])[:, :, 0]
     squares = np.where(held, force**2, 0.0).sum(axis=0)

@@ -194,7 +194,26 @@ class DynamicsPosterior(ShortRepr):
         return np.asarray(5.0 * np.abs(self.data.outputs).max(axis=0))
 
     def _limited(self, mean: KernelExpansion) -> DynamicsDraws:
-        return DynamicsDraws(self.covariances.model, self.data, (mean,), limit=self.limit[self.data.learned])
+        least = np.zeros(len(mean.weights))  # nothing shows that friction at rest is larger
+        return DynamicsDraws(self._model(least), self.data, (mean,), limit=self.limit[self.data.learned])
+
+    @functools.cached_property
+    def resting(self) -> tuple[Array, Array, Array] | None:
+        """The least and the largest dry friction at rest, and as joints turn, ``(m,)`` each; None without friction."""
+        model, steps = self.covariances.model, self.data.executions
+        if not isinstance(model, DryFriction):
+            return None
+        mean = DynamicsDraws(model, self.data, (self.most_probable.mean,), limit=self.limit[self.data.learned])
+        with single_threaded(), np.errstate(all="ignore"):
+            return model.resting(steps, lambda acting: mean.residuals(steps.x[None], acting[None])[0])
+
+    def _model(self, shares: Array) -> Model:
+        """Return the model of draws ``(S,)`` whose friction at rest is a share of the way to the largest one."""
+        model = self.with_most_friction
+        if not isinstance(model, DryFriction) or self.resting is None:
+            return model
+        least, largest, _ = self.resting
+        return replace(model, rest=(least + shares[:, None] * (largest - least))[:, None])
 
     def unfamiliarity(self, states: Array, inputs: Array) -> Array:
         """Return the standard deviation of r along states and inputs ``(q, H, m)``, as a share of a typical step."""
@@ -204,6 +223,14 @@ class DynamicsPosterior(ShortRepr):
         variance = most.whitened(Z.reshape(-1, Z.shape[-1]))[1].reshape(Z.shape[:2]).mean(axis=1)
         sizes = (data.sizes / data.steps)[data.learned] ** 2 * most.squares / len(most.centres)
         return np.asarray(np.sqrt(variance * sizes.mean()))
+
+    @property
+    def with_most_friction(self) -> Model:
+        """The model to which residuals are added, with the largest dry friction at rest."""
+        model = self.covariances.model
+        if not isinstance(model, DryFriction) or self.resting is None:
+            return model
+        return replace(model, rest=self.resting[1], passed=self.resting[2])
 
     # Draws
 
@@ -230,7 +257,11 @@ class DynamicsPosterior(ShortRepr):
             groups = [list(group) for _, group in groupby(components, lambda component: id(component.factor))]
             drawn = [draw_functions(group, relevant, count, settings.pivots, rng) for group in groups]
         expansions, left_out = zip(*drawn, strict=True)
-        return DynamicsDraws(self.covariances.model, self.data, joined(expansions), max(left_out))
+        draws = DynamicsDraws(self.covariances.model, self.data, joined(expansions), max(left_out))
+        if self.resting is not None:  # nothing is known of the friction at rest between its bounds
+            shares = (rng.permutation(len(draws)) + rng.random(len(draws))) / len(draws)
+            draws = replace(draws, model=self._model(shares))
+        return draws
 
     @property
     def deviations(self) -> Array:

@@ -37,6 +37,8 @@ from ctxval.learning.worst_case import WorstCase
 if TYPE_CHECKING:
     from ctxval.learning.dynamics_study import DynamicsStudy
 
+_LARGER = 1.02  # multiple of the friction in motion from which that at rest is named
+
 
 @dataclass(frozen=True, eq=False)
 class LearnedDynamics(ShortRepr):
@@ -208,16 +210,17 @@ class LearnedDynamics(ShortRepr):
     def friction(self) -> dict[str, float]:
         """The dry friction at the inputs that have some, by their labels.
 
-        If it is larger at rest, or grows with the input, it is followed by that at rest, or by its share of the input.
+        If the executions permit more at rest, that follows, and its share of the input if it grows with it.
         """
-        friction, sizes = self.study.friction, dict[str, float]()
-        if friction is not None:
+        friction, resting, sizes = self.study.friction, self.posterior.resting, dict[str, float]()
+        if friction is not None and resting is not None:
             of_inputs = self.labels[-self.posterior.data.inputs :]
-            each_input = np.stack([friction.sliding, friction.excess, friction.load], axis=1).tolist()
-            for label, (sliding, excess, load) in zip(of_inputs, each_input, strict=True):
+            each_input = np.stack([friction.sliding, resting[1], friction.load], axis=1).tolist()
+            for label, (sliding, at_rest, load) in zip(of_inputs, each_input, strict=True):
                 name, _ = parted(label)
                 sizes[label] = sliding
-                sizes[label.replace(name, f"{name} at rest", 1)] = sliding + excess if excess else 0.0
+                at_most = label.replace(name, f"{name} at rest at most", 1)
+                sizes[at_most] = at_rest if at_rest > _LARGER * sliding else 0.0
                 sizes[f"share of {name}"] = load
         return {label: size for label, size in sizes.items() if size}
 

@@ -111,7 +111,7 @@ class NoiseStudy:
         data = posterior.data
         try:
             with single_threaded(), np.errstate(all="ignore"):
-                model, pairs = posterior.covariances.model, self.extended.pairs
+                model, pairs = posterior.with_most_friction, self.extended.pairs
                 fit, chosen = fit_structures(model, records, pairs, data.learned, chosen, self.structures)
         except (np.linalg.LinAlgError, InputError, ValueError):  # numbers that are not finite
             return None

@@ -42,6 +42,7 @@ class ResidualData:
     # executed: which of them are of executions, (R,)
     recorded: Array
     executed: Mask
+    executions: Transitions  # those of executions, also of joints that friction holds
 
     def standardised(self, x: Array, u: Array) -> Array:
         """Return standardised pairs ``(..., n + m)`` of states and the first m inputs, which act."""
@@ -51,6 +52,7 @@ class ResidualData:
 def residual_data(model: Model, transitions: Transitions, sources: Rows) -> ResidualData | None:
     """Return the residuals of a model; None if fewer than two transitions are usable, or if M explains all of them."""
     recorded, moving = np.concatenate([transitions.x, transitions.u], axis=1), np.ones(len(transitions), dtype=np.bool_)
+    every = transitions
     if isinstance(model, DryFriction):
         transitions, moving = model.acting(transitions)
         model = model.model
@@ -84,6 +86,7 @@ def residual_data(model: Model, transitions: Transitions, sources: Rows) -> Resi
         transitions=transitions[teach],
         recorded=(recorded[usable] - shift) / scale,
         executed=sources[usable] >= 0,
+        executions=every[np.flatnonzero(usable & (sources >= 0))],
     )
 
 
