@@ -20,6 +20,7 @@ from ctxval._util.texts import (
     enumerated,
     guarded,
     markdown_text,
+    parted,
     plain,
     reason_of,
     shortened,
@@ -167,6 +168,21 @@ def test_a_guarded_reason_in_a_table_of_runs_is_what_was_meant(tmp_path: Path) -
     (tmp_path / "runs.csv").write_text("goal,failed,trajectory\n1.5,'=E12: overcurrent,\n2.5,'twas loose,\n")
     runs = read_runs([tmp_path / "runs.csv"], None, TaskSpace(goal=(-3.0, 3.0)))
     assert [run.result.failed for run in runs] == ["=E12: overcurrent", "'twas loose"]
+
+
+@pytest.mark.parametrize(
+    ("label", "parts"),
+    [
+        ("torque [N m]", ("torque", "N m")),
+        ("torque at rest at most [N m]", ("torque at rest at most", "N m")),
+        ("u[0]", ("u[0]", "")),
+        ("u[0] at rest at most", ("u[0] at rest at most", "")),
+        ("x[1] [rad]", ("x[1]", "rad")),
+        ("angle", ("angle", "")),
+    ],
+)
+def test_a_label_has_a_name_and_a_unit(label: str, parts: tuple[str, str]) -> None:
+    assert parted(label) == parts
 
 
 def test_columns_are_as_wide_as_their_longest_cell() -> None:

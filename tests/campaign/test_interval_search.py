@@ -386,6 +386,15 @@ def test_no_task_is_executed_a_second_time() -> None:
     assert next_task(contested, everywhere, 0.2, 2.0, 0.95, NewTasks()) is None
 
 
+def test_friction_at_rest_is_tried_at_the_least_that_exceeds_the_limit() -> None:
+    rubbing = replace(evidence(), friction={"u[0]": 0.4})
+    limit = float(np.sort(rubbing.maxima)[-6:-4].mean())
+    least = rubbing.points[np.argsort(rubbing.maxima)[-5]]
+    known = np.array([[0.9, 0.05], [0.05, 0.9], [0.5, 0.5]])
+    assert asked(rubbing, known, limit) == least.tolist()
+    assert asked(replace(rubbing, friction={}), known, limit) != least.tolist()
+
+
 def test_a_task_is_new_by_the_parameters_that_change_predictions() -> None:
     contested, seen = evidence(), np.array([0])
     farthest, at_bound = contested.coverage.task, contested.points[38]
