@@ -167,8 +167,8 @@ def test_none_is_found_where_there_is_none(transitions: Transitions) -> None:
 def test_a_joint_that_creeps_while_it_is_held_is_found_to_do_so() -> None:
     def creeping(x: Array, u: Array) -> Array:
         speed = x[..., 1] + DT * u[..., 0]
-        held = np.abs(speed - 0.004 * u[..., 0]) <= DT * GRIP  # friction is what the input exceeds the creep by
-        slowed = np.where(held, 0.004 * u[..., 0], speed - DT * GRIP * np.sign(speed))
+        held = np.abs(speed - 0.006 * u[..., 0]) <= DT * GRIP  # friction is what the input exceeds the creep by
+        slowed = np.where(held, 0.006 * u[..., 0], speed - DT * GRIP * np.sign(speed))
         return np.stack([x[..., 0] + DT * slowed, slowed], axis=-1)
 
     rng = np.random.default_rng(0)
@@ -177,8 +177,14 @@ def test_a_joint_that_creeps_while_it_is_held_is_found_to_do_so() -> None:
     friction = found_friction(MODEL, Transitions(x, u[:, None], creeping(x, u[:, None])))
     assert friction is not None
     assert friction.sliding[0] == pytest.approx(GRIP, rel=0.02)
-    assert friction.creep[0] == pytest.approx(0.004, rel=0.1)
-    np.testing.assert_allclose(friction.step(resting, u[200:, None]), creeping(resting, u[200:, None]), atol=4e-4)
+    assert friction.creep[0] == pytest.approx(0.006 / (1 - 0.006 / DT), rel=0.02)  # for a unit of friction
+    np.testing.assert_allclose(friction.step(resting, u[200:, None]), creeping(resting, u[200:, None]), atol=6e-4)
+    # A joint that begins to creep does not move yet.
+    start, push = np.array([[0.3, 0.0]]), np.array([[2.0]])
+    x, u = np.concatenate([x, start]), np.concatenate([u[:, None], push])
+    least, largest, _ = friction.resting(Transitions(x, u, creeping(x, u)), lambda acting: np.zeros_like(x))
+    assert least[0] == pytest.approx(GRIP, rel=0.02)
+    assert largest[0] == pytest.approx(2.0, rel=0.05)
 
 
 def test_two_inputs_of_one_rate_have_no_friction_of_their_own() -> None:

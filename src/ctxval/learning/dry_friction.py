@@ -132,14 +132,15 @@ class DryFriction:
             for _ in range(_NEWTON):
                 holding[:, j] += (rates_with(holding) - before)[:, j] / of_rates[:, j, j]
             withstood = np.abs(holding[:, j]) - self.load[j] * np.abs(u[:, j])
-            own, accelerated = np.abs(of_rates[:, j, j]), np.abs(holding - force)[:, j]
-            little = np.maximum(usual[j], _LITTLE * withstood)
-            rests = np.abs(before[:, j]) <= little * own
-            most = float(withstood[rests & (accelerated <= little)].max(initial=0.0))
+            # A held joint creeps, and rates below what little of the force changes cannot be told apart.
+            little = np.maximum(usual[j], _LITTLE * withstood) * np.abs(of_rates[:, j, j])
+            slow = np.maximum(little, 2 * self.creep[j] * withstood)
+            first, last = np.abs(before[:, j]), np.abs(after[:, j])
+            most = float(withstood[(first <= slow) & (last <= slow)].max(initial=0.0))
             least[j] = max(self.sliding[j], most - usual[j])
-            started = rests & (accelerated > 2 * little) & (withstood > most)
+            started = (first <= slow) & (last > 2 * slow) & (withstood > most)
             largest[j] = max(least[j], withstood[started].min(initial=largest[j]) + usual[j])
-            turned = ((before * after)[:, j] < 0) & (np.minimum(np.abs(before), np.abs(after))[:, j] > little * own)
+            turned = ((before * after)[:, j] < 0) & (np.minimum(first, last) > slow)
             passed[j] = withstood[turned].min(initial=np.inf) + usual[j]
         return least, largest, passed
 
