@@ -138,7 +138,7 @@ class DryFriction:
             first, last = np.abs(before[:, j]), np.abs(after[:, j])
             most = float(withstood[(first <= slow) & (last <= slow)].max(initial=0.0))
             least[j] = max(self.sliding[j], most - usual[j])
-            started = (first <= slow) & (last > 2 * slow) & (withstood > most)
+            started = (first <= slow) & (last > np.maximum(2 * little, slow)) & (withstood > most)
             largest[j] = max(least[j], withstood[started].min(initial=largest[j]) + usual[j])
             turned = ((before * after)[:, j] < 0) & (np.minimum(first, last) > slow)
             passed[j] = withstood[turned].min(initial=np.inf) + usual[j]
