@@ -637,7 +637,7 @@ ATTACKS: dict[str, Callable[[], object]] = {
     "validation": hostile_validation,
     "experiment": lambda: Experiment(HOSTILE, hostile_validation(), units=HOSTILE),
     "campaign": lambda: Campaign(hostile_validation(), name=HOSTILE),
-    "many parameters": lambda: TaskSpace(**{f"parameter_{i}": (0, 1, "rad") for i in range(1000)}),
+    "many parameters": lambda: TaskSpace(**{f"parameter_{i}": (0, 1, "rad") for i in range(10_000)}),
     "trajectory": lambda: Trajectory(TASK.times, np.zeros((26, 2)), np.zeros((25, 1)), HOSTILE),
     "truth": lambda: Truth(1.0, SPACE.parameters([1, 2, 3, 4]), HOSTILE),
     "made good": lambda: certificates.MadeGood(1, 2, HOSTILE),

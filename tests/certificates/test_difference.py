@@ -82,11 +82,11 @@ def test_the_sign_of_nothing_is_seldom_decided_whenever_one_stops() -> None:
 @pytest.mark.slow
 def test_intervals_cover_whenever_one_stops() -> None:
     rng, beta, missed = np.random.default_rng(1), 0.1, 0
-    for _ in range(10):
+    for _ in range(20):
         values = 0.3 + rng.normal(size=60)
         found = [mean_difference(paired(values[:n]), beta) for n in range(20, 61, 20)]
         missed += any(not one.low <= 0.3 <= one.high for one in found)
-    assert missed <= 10 * beta + 3 * np.sqrt(10 * beta * (1 - beta))
+    assert missed <= 20 * beta + 3 * np.sqrt(20 * beta * (1 - beta))
 
 
 def test_a_good_prediction_decides_with_fewer_tasks() -> None:

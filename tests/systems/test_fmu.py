@@ -24,6 +24,7 @@ from typer.testing import CliRunner
 
 from ctxval import (
     Campaign,
+    Store,
     Task,
     TaskSpace,
     Validation,
@@ -583,6 +584,9 @@ def test_an_experiment_file_validates_a_learned_model_on_an_fmu(
     assert (ran["executions"], ran["failed"], ran["threshold"]) == (4, 0, 5.0)
     assert ran["worst"]["distance"] > 0
     assert report("status", "cart.sqlite")["executions"] == 4
+    again = report("run", "experiment.toml", "--budget", "5", "--no-report")
+    assert again["executions"] == 5
+    assert len(Store("cart.sqlite").trials()) == 5
     status = CliRunner().invoke(
         app, ["run", "experiment.toml", "--budget", "5", "--threshold", "1e-9", "--no-report", "--json"]
     )

@@ -217,7 +217,11 @@ def test_a_form_that_cannot_be_used_is_refused_in_place(
         (b"", {}, "run.csv: it is not a recording of this trial. The columns or fields t [s], position [m], speed"),
         (SHORT, {}, "must have 21 times"),
         *more(  # in test_recording_process.py, too
-            (b"a,b\n1,2\n3,4\n", {}, "position [m], speed [m/s], force [N] are needed, with a finite number for each"),
+            (
+                b"a,b\n1,2\n3,4\n",
+                {},
+                "position [m], speed [m/s], force [N] are needed, with a finite number for each time",
+            ),
             (b"t,position,speed,force\n0,0,0,1\n0.1,0,x,1\n0.2,0,0,1\n", {}, "run.csv, line 3: it is not a recording"),
             (b"\x00\xff\xfe", {}, "run.csv: it is not a recording of this trial"),
             (b"t,position [ft],speed,force\n0,0,0,1\n0.1,0,0,1\n", {}, "position [m]"),
