@@ -18,8 +18,13 @@ REGULAR = ("cart-pole", "gantry", "scara", "harmonic-drive", "xy-table")
 """Others whose friction is of a kind that is learned."""
 OTHERS = ("worn-guide", "two-way-ratchet")
 """Others whose friction changes with the place or the direction."""
-AT_REST = ("cylinder", "rotary-seal", "sealed-table")
-"""Others whose friction is larger at rest than at any rate, which only the smallest moves show."""
+DEVELOPED_AT_REST = ("cylinder", "rotary-seal", "sealed-table")
+"""Others, whose friction is larger at rest than at any rate, which only the smallest moves show.
+
+The choice of tasks was developed on them.
+"""
+AT_REST = ("lip-seal", "sealed-gantry", "sealed-lift")
+"""Others like these, which were written after it."""
 
 Push = Callable[[Array, Array, Array], Array]
 """The accelerations ``(..., k)`` at positions, speeds and inputs."""
@@ -143,19 +148,27 @@ def worn_guide(worn: float, friction: float) -> Push:
     return lambda q, w, u: u - 0.5 * w - np.where((q > 0.5) & (q < 0.74), worn, friction) * coulomb(w)
 
 
+def lift(weight: float = 0.8) -> Push:
+    """A platform whose weight is not balanced."""
+    return lambda q, w, u: u - 0.6 * w - weight
+
+
 def loaded_gear(share: float, friction: float) -> Push:
     """An axis whose friction grows with the torque that it transmits."""
     return lambda q, w, u: u - 0.5 * w - (friction + share * np.abs(u)) * coulomb(w)
 
 
-def sealed(push: Push, sliding: Array, rest: Array, dt: float, substeps: int = 40) -> models.Function:
-    """Return joints that rest until a force overcomes more than they slide with; push is without friction."""
+def sealed(push: Push, sliding: Array, rest: Array, back: Array, dt: float, substeps: int = 40) -> models.Function:
+    """Return joints that rest until a force overcomes more than they slide with; push is without friction.
+
+    They rest against pushes above 0 up to ``rest``, and against those below 0 up to ``back``.
+    """
 
     def step(x: Array, u: Array) -> Array:
         k, h = x.shape[-1] // 2, dt / substeps
         places, speeds = x[..., :k], x[..., k:]
         free = speeds + h * push(places, speeds, u)
-        grips = np.where(speeds == 0, rest, sliding)
+        grips = np.where(speeds == 0, np.where(free > 0, rest, back), sliding)
         speeds = np.sign(free) * np.maximum(np.abs(free) - h * grips, 0.0)
         return np.concatenate([places + h * speeds, speeds], axis=-1)
 
@@ -195,7 +208,7 @@ def _moves(unit: str, start: float, goal: float, *, of: str = "") -> dict[str, t
 
 def with_seals(
     name: str, units: str, space: TaskSpace, push: Push, sliding: object, rest: object,
-    Q: list[float], R: float, inputs: int = 1,
+    Q: list[float], R: float, inputs: int = 1, back: object = None,
 ) -> Experiment:  # fmt: skip
     """Return an experiment with friction that is larger at rest, which M lacks, and joints 5 % heavier than in M."""
 
@@ -203,7 +216,7 @@ def with_seals(
         return push(q, w, u) / 1.05
 
     dt, places = 0.04, tuple(range(inputs))
-    joints = sealed(heavier, np.asarray(sliding), np.asarray(rest), dt)
+    joints = sealed(heavier, np.asarray(sliding), np.asarray(rest), np.asarray(rest if back is None else back), dt)
     return pair(name, units, space, joints, push, 60, dt, Q, R, places, inputs)
 
 
@@ -253,5 +266,16 @@ SYSTEMS: dict[str, Callable[[], Experiment]] = {
     "sealed-table": lambda: with_seals(
         "sealed-table", "m", TaskSpace(**_moves("m", 0.4, 0.8, of="_x"), **_moves("m", 0.4, 0.8, of="_y")),
         xy_table(1.5, (0.0, 0.0, 0.0)), [0.5, 0.3], [0.7, 0.45], [20.0, 20.0, 2.0, 2.0], 0.2, 2,
+    ),
+    "lip-seal": lambda: with_seals(
+        "lip-seal", "m", TaskSpace(**_moves("m", 0.8, 1.6)),
+        ball_screw(0.0, 0.0), 0.4, 0.75, [15.0, 1.5], 0.5, back=0.5,
+    ),
+    "sealed-gantry": lambda: with_seals(
+        "sealed-gantry", "m", TaskSpace(**_moves("m", 0.8, 1.5)),
+        gantry(0.0, 0.3), [0.7, 0.0], [1.1, 0.0], [20.0, 10.0, 5.0, 1.0], 0.2,
+    ),
+    "sealed-lift": lambda: with_seals(
+        "sealed-lift", "m", TaskSpace(**_moves("m", 0.6, 1.2)), lift(), 0.5, 0.75, [20.0, 2.0], 0.3,
     ),
 }  # fmt: skip

@@ -42,7 +42,7 @@ def sticky_step(
 def rubbing(model: models.Linear, rates: list[int], sliding: Array) -> DryFriction:
     m = len(rates)
     sizes = sliding, *np.zeros((2, m)), np.ones(m), np.zeros(m), np.full(m, 1e-3), np.zeros(m)
-    return DryFriction(model, np.array(rates), *sizes, rest=sliding, passed=np.full(m, np.inf))
+    return DryFriction(model, np.array(rates), *sizes, rest=np.stack([sliding] * 2), passed=np.full(m, np.inf))
 
 
 def recorded(step: Any, count: int = 300, inputs: int = 1) -> Transitions:
@@ -73,13 +73,15 @@ def test_what_holds_a_joint_at_rest_is_bounded_by_what_it_withstood_and_what_set
 
     transitions = Transitions(x, inputs, step(x, inputs))
     least, largest, passed = known.resting(transitions, missed)
-    assert least[0] == pytest.approx(1.1, abs=0.01)
-    assert largest[0] == pytest.approx(1.3, abs=0.02)
+    assert least[:, 0] == pytest.approx([1.1, GRIP], abs=0.01)
+    assert largest[:, 0] == pytest.approx([1.3, 2.0], abs=0.02)
     assert passed[0] > GRIP
-    held = replace(known, rest=np.array([1.2]))
+    held = replace(known, rest=np.array([[1.2], [1.2]]))
     np.testing.assert_allclose(held.following(still, u, lambda acting: 0 * still)[:2], 0.0, atol=1e-12)
     slid = DT * np.sign(u[2:, 0]) * (np.abs(u[2:, 0]) - GRIP)
     np.testing.assert_allclose(held.step(still, u)[2:, 1], slid, atol=1e-9)
+    lip = replace(known, rest=np.array([[1.2], [0.9]]))
+    np.testing.assert_array_equal(lip.step(still, np.array([[1.1], [-1.1], [0.85], [-1.3]]))[:, 1] != 0, [1, 0, 0, 1])
 
 
 @given(st.lists(st.floats(-3, 3), min_size=4, max_size=4), st.floats(0, 5), st.floats(0, 5))
@@ -183,8 +185,8 @@ def test_a_joint_that_creeps_while_it_is_held_is_found_to_do_so() -> None:
     start, push = np.array([[0.3, 0.0]]), np.array([[2.0]])
     x, u = np.concatenate([x, start]), np.concatenate([u[:, None], push])
     least, largest, _ = friction.resting(Transitions(x, u, creeping(x, u)), lambda acting: np.zeros_like(x))
-    assert least[0] == pytest.approx(GRIP, rel=0.02)
-    assert largest[0] == pytest.approx(2.0, rel=0.05)
+    assert least[:, 0] == pytest.approx(GRIP, rel=0.02)
+    assert largest[1, 0] == pytest.approx(2.0, rel=0.05)
 
 
 def test_two_inputs_of_one_rate_have_no_friction_of_their_own() -> None:

@@ -128,9 +128,7 @@ class IntervalSearch:
         evidence = self._evidence()
         if evidence is not None and (task := self._beside_a_failed_test(evidence)) is not None:
             return Choice.tested(task)
-        # Earlier predictions may have failed before it was known that a history or noise matters.
-        history = evidence is not None and (evidence.quantile is not None or evidence.lags > 0)
-        if evidence is None or (self._fails(evidence) and not history):
+        if evidence is None or self._fails(evidence):
             return self._by_distance()
         return self._by_dynamics(evidence)
 
@@ -288,7 +286,9 @@ class IntervalSearch:
 
     def _fails(self, evidence: DynamicsEvidence) -> bool:
         """Return whether predictions fail so often that the dynamics cannot be learned."""
-        if isinstance(self.options.kind, Dynamics):
+        # Earlier predictions may have failed before it was known that a history, noise or dry friction matters.
+        known_since = evidence.quantile is not None or evidence.lags > 0 or evidence.friction
+        if known_since or isinstance(self.options.kind, Dynamics):
             return False
         bound = evidence.upper(self.options.confidence)
         tolerated = max(min(bound, self.limit), self.limit - bound)  # as far as the margin to the limit allows

@@ -18,6 +18,8 @@ from ctxval.certificates.dynamics_diagnostics import (
     untried_parameter,
 )
 
+_NEARS = 0.7  # share of the way from the largest executed distance to the limit from which a draw is near it
+
 
 @dataclass(frozen=True, eq=False)
 class NewTasks:
@@ -62,13 +64,13 @@ def next_task(
     order = np.argsort(evidence.maxima, kind="stable")
     rank = evidence.rank(confidence)
     highest = evidence.points[[*order[rank::-1], *order[:rank:-1]]]
-    if (
-        evidence.friction
-    ):  # one execution at the least friction at rest that exceeds the limit rules out all larger ones
-        highest = evidence.points[np.argsort(np.where(evidence.maxima > limit, evidence.maxima, np.inf), kind="stable")]
+    if evidence.friction:  # one execution at the least friction at rest that nears the limit rules out all larger ones
+        nears = evidence.maxima > best + _NEARS * (limit - best)
+        highest = evidence.points[np.argsort(np.where(nears, evidence.maxima, np.inf), kind="stable")]
     farthest, largest = evidence.coverage.task[None], evidence.elites
     exceeds = evidence.upper(confidence) > limit
-    if exceeds and len(known) % 3 == 2:  # every third execution leads farthest from the records in any case
+    # Every third execution leads farthest from the records in any case, but friction is known where they are dense.
+    if exceeds and len(known) % 3 == 2 and (not evidence.friction or uncovered(evidence)):
         candidates = [farthest, highest]
     elif evidence.highest > limit:
         candidates = [largest, highest, farthest]

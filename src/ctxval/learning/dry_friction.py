@@ -8,7 +8,8 @@ may be larger at low rates (Stribeck 1902). What M misses is a smooth function o
 that act. It is learned of steps in which all these rates move, because f is known there.
 
 What holds a joint at rest may be larger than what any motion shows, as that of seals and guides. Steps at rest bound
-it: it is at least the largest force that a joint withstood, and less than the smallest one that set a joint in motion.
+it in each direction: it is at least the largest force that a joint withstood, and less than the smallest one that set
+it in motion.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class DryFriction:
     creep: Array  # the rate at which a held joint creeps under a unit of its input (m,)
     change: Array  # by which inputs are changed to see what they do (m,)
     still: Array  # the largest rate of a joint at rest (m,)
-    rest: Array  # the largest friction at rest if no input acts (m,), or of draws (S, 1, m)
+    rest: Array  # the largest friction at rest against pushes below and above 0 (2, m), or of draws (S, 1, 2, m)
     passed: Array  # the largest friction that holds a joint as it turns (m,)
 
     def __getitem__(self, rows: ArrayLike) -> DryFriction:
@@ -93,9 +94,10 @@ class DryFriction:
                 # A joint at rest, or one that turns, is held if friction withstands what acts on it then.
                 rests = np.abs(before[..., j]) <= self.still[j]
                 turns = (free - own * np.clip(stopping, -limit, limit)) * before[..., j] <= 0
-                most = np.where(rests, self.rest[..., j], np.minimum(self.rest[..., j], self.passed[j]))
-                withstood = np.abs(np.nan_to_num((free - before[..., j]) / own)) - self.load[j] * np.abs(u[..., j])
-                held = (rests | turns) & (withstood <= most)
+                push = np.nan_to_num((free - before[..., j]) / own)
+                most = np.where(push > 0, self.rest[..., 1, j], self.rest[..., 0, j])
+                most = np.where(rests, most, np.minimum(most, self.passed[j]))
+                held = (rests | turns) & (np.abs(push) - self.load[j] * np.abs(u[..., j]) <= most)
                 force[..., j] = np.where(held, stopping, np.clip(stopping, -limit, limit))
         return force
 
@@ -107,9 +109,9 @@ class DryFriction:
     def resting(self, transitions: Transitions, missed: Callable[[Array], Array]) -> tuple[Array, Array, Array]:
         """Return the least and the largest friction at rest, and that of turning joints, that transitions permit.
 
-        Each has the shape ``(m,)``. M misses ``missed(acting inputs)``. Friction that depends on the place or on the
-        time at rest holds at one force and not at a smaller one: then only larger forces that set a joint in motion
-        count.
+        Those at rest, against pushes below and above 0, have the shape ``(2, m)``, the last one ``(m,)``. M misses
+        ``missed(acting inputs)``. Friction that depends on the place or on the time at rest holds at one force and not
+        at a smaller one: then only larger forces that set a joint in motion count.
         """
         x, u, m = transitions.x, transitions.u, len(self.rates)
         before, after = x[:, self.rates], transitions.x_next[:, self.rates]
@@ -125,7 +127,8 @@ class DryFriction:
         moves = _directions(transitions, self.rates)
         errors = np.abs(force - self._limits(u, before, after) * moves)[(moves != 0).all(axis=1)]
         usual = _ERRORS * np.median(errors, axis=0)
-        least, largest, passed = self.sliding.copy(), np.abs(u).max(axis=0), np.full(m, np.inf)
+        least, largest = np.stack([self.sliding] * 2), np.stack([np.abs(u).max(axis=0)] * 2)
+        passed = np.full(m, np.inf)
         for j in range(m):
             holding = force.copy()  # what would have kept this joint at its rate
             holding[:, j] += (after - before)[:, j] / of_rates[:, j, j]
@@ -136,10 +139,11 @@ class DryFriction:
             little = np.maximum(usual[j], _LITTLE * withstood) * np.abs(of_rates[:, j, j])
             slow = np.maximum(little, 2 * self.creep[j] * withstood)
             first, last = np.abs(before[:, j]), np.abs(after[:, j])
-            most = float(withstood[(first <= slow) & (last <= slow)].max(initial=0.0))
-            least[j] = max(self.sliding[j], most - usual[j])
-            started = (first <= slow) & (last > np.maximum(2 * little, slow)) & (withstood > most)
-            largest[j] = max(least[j], withstood[started].min(initial=largest[j]) + usual[j])
+            for i, pushed in enumerate((holding[:, j] <= 0, holding[:, j] > 0)):
+                most = float(withstood[pushed & (first <= slow) & (last <= slow)].max(initial=0.0))
+                least[i, j] = max(self.sliding[j], most - usual[j])
+                started = pushed & (first <= slow) & (last > np.maximum(2 * little, slow)) & (withstood > most)
+                largest[i, j] = max(least[i, j], withstood[started].min(initial=largest[i, j]) + usual[j])
             turned = ((before * after)[:, j] < 0) & (np.minimum(first, last) > slow)
             passed[j] = withstood[turned].min(initial=np.inf) + usual[j]
         return least, largest, passed
@@ -225,7 +229,7 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
         _creep(transitions, reached, effects, rates, still),
         1e-3 * ranges,
         still,
-        rest=largest[0] + excess,
+        rest=np.stack([largest[0] + excess] * 2),
         passed=np.full(m, np.inf),
     )
 

@@ -195,11 +195,11 @@ class DynamicsPosterior(ShortRepr):
 
     def _limited(self, mean: KernelExpansion) -> DynamicsDraws:
         least = np.zeros(len(mean.weights))  # nothing shows that friction at rest is larger
-        return DynamicsDraws(self._model(least), self.data, (mean,), limit=self.limit[self.data.learned])
+        return DynamicsDraws(self.model_with(least), self.data, (mean,), limit=self.limit[self.data.learned])
 
     @functools.cached_property
     def resting(self) -> tuple[Array, Array, Array] | None:
-        """The least and the largest dry friction at rest, and as joints turn, ``(m,)`` each; None without friction."""
+        """The least and the largest dry friction at rest ``(2, m)``, and as joints turn ``(m,)``; None without any."""
         model, steps = self.covariances.model, self.data.executions
         if not isinstance(model, DryFriction):
             return None
@@ -207,13 +207,13 @@ class DynamicsPosterior(ShortRepr):
         with single_threaded(), np.errstate(all="ignore"):
             return model.resting(steps, lambda acting: mean.residuals(steps.x[None], acting[None])[0])
 
-    def _model(self, shares: Array) -> Model:
+    def model_with(self, shares: Array) -> Model:
         """Return the model of draws ``(S,)`` whose friction at rest is a share of the way to the largest one."""
         model = self.with_most_friction
         if not isinstance(model, DryFriction) or self.resting is None:
             return model
         least, largest, _ = self.resting
-        return replace(model, rest=(least + shares[:, None] * (largest - least))[:, None])
+        return replace(model, rest=(least + shares[:, None, None] * (largest - least))[:, None])
 
     def unfamiliarity(self, states: Array, inputs: Array) -> Array:
         """Return the standard deviation of r along states and inputs ``(q, H, m)``, as a share of a typical step."""
@@ -260,7 +260,7 @@ class DynamicsPosterior(ShortRepr):
         draws = DynamicsDraws(self.covariances.model, self.data, joined(expansions), max(left_out))
         if self.resting is not None:  # nothing is known of the friction at rest between its bounds
             shares = (rng.permutation(len(draws)) + rng.random(len(draws))) / len(draws)
-            draws = replace(draws, model=self._model(shares))
+            draws = replace(draws, model=self.model_with(shares))
         return draws
 
     @property

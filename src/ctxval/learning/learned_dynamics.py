@@ -26,7 +26,7 @@ from ctxval.learning.coverage import (
     largest_pocket,
     position_states,
 )
-from ctxval.learning.draws import Draws
+from ctxval.learning.draws import Draws, DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import NoisyPosterior
@@ -215,7 +215,7 @@ class LearnedDynamics(ShortRepr):
         friction, resting, sizes = self.study.friction, self.posterior.resting, dict[str, float]()
         if friction is not None and resting is not None:
             of_inputs = self.labels[-self.posterior.data.inputs :]
-            each_input = np.stack([friction.sliding, resting[1], friction.load], axis=1).tolist()
+            each_input = np.stack([friction.sliding, resting[1].max(axis=0), friction.load], axis=1).tolist()
             for label, (sliding, at_rest, load) in zip(of_inputs, each_input, strict=True):
                 name, _ = parted(label)
                 sizes[label] = sliding
@@ -318,6 +318,8 @@ class LearnedDynamics(ShortRepr):
             if self.noisy is None and not len(pairs):
                 return None
             draws = self.drawn_from.draw(pairs[rng.permutation(len(pairs))[:300]], rng)
+            if isinstance(draws, DynamicsDraws):  # if friction at rest made predictions vague, they could not fail
+                draws = replace(draws, model=self.posterior.model_with(np.zeros(len(draws))))
             return predict_execution(planner, draws, point, len(self.executed), self.study.extended.recorded)
 
     def _rng(self, purpose: int) -> np.random.Generator:

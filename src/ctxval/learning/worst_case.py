@@ -21,6 +21,7 @@ from ctxval.gp.ascent import ascend
 from ctxval.gp.global_search import search_globally
 from ctxval.learning.closed_loops import AnyPosterior, LoopPlanner, PlannedTasks, loop_pairs
 from ctxval.learning.draws import Draws
+from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
 _DIVERGED = 1e30  # the distance of a loop that diverges, in searches: larger than all others, and finite
 _EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)  # tasks of a global search, for 1, 2, ... parameters
@@ -28,6 +29,7 @@ _SHOWN = 16  # largest number of these tasks
 _NEARBY = 1e-3  # largest change of each coordinate to a task that is nearly the same
 _NEARER = 64  # how many times nearer tasks are that tell kinks of a distance from jumps, a power of 2
 _SCREENED = (8, 1500)  # number of draws of the hyperparameters in a screening, and of tasks in its search on the mean
+_FURTHER = 256  # number of random tasks beside these if draws differ in the dry friction at rest
 _APART = 0.15  # least distance of two tasks that are not next to each other, as a share of the cube's diagonal
 
 
@@ -211,6 +213,10 @@ class WorstCaseSearch:
         with single_threaded():
             tasks = self._shared_tasks(of_mean, known, self.settings.shared // 4, rng)
             draws = posterior.draw(self.relevant(posterior, tasks, rng), rng, 1, _SCREENED[0])
+            if _sticks(posterior) and self.members is None:  # their largest distances lie far from those of the mean
+                further = self.pool[rng.permutation(len(self.pool))[:_FURTHER]]
+                points, maxima, loops = self._search_draws(draws, np.concatenate([tasks, further]), rng)
+                return of_mean.with_draws(maxima, points, loops, draws.left_out)
             values = self._distances(draws, tasks)
         return of_mean.with_draws(values.max(axis=1), tasks[values.argmax(axis=1)], values.size, draws.left_out)
 
@@ -235,7 +241,9 @@ class WorstCaseSearch:
             beside = np.concatenate([peaks[:, None], np.clip(peaks[:, None] + moves, 0, 1)], axis=1)
             flat = self._distances(posterior.mean, beside.reshape(-1, self.dimension))[0]
             distances = np.maximum(flat.reshape(beside.shape[:2]), 0.0)
-            peak, next_to_it = distances[:, 0], np.median(distances[:, 1:], axis=1)
+            # Where a joint may be held, distances jump, but a task there is like those on one side of it.
+            peak, share = distances[:, 0], 0.9 if _sticks(posterior) else 0.5
+            next_to_it = np.quantile(distances[:, 1:], share, axis=1)
             lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
         sharpness = float(max(lost.max(initial=0.0), 0.0))
         return replace(of_mean.with_draws(maxima, points, loops, draws.left_out), sharpness=sharpness)
@@ -330,6 +338,11 @@ class WorstCaseSearch:
         chosen = np.flatnonzero(may_be_worst)
         values[np.ix_(others, chosen)] = self._distances(draws[others], tasks[chosen])
         return values, len(first) * len(tasks) + len(others) * len(chosen)
+
+
+def _sticks(posterior: AnyPosterior) -> bool:
+    """Return whether draws differ in the dry friction at rest."""
+    return isinstance(posterior, DynamicsPosterior) and posterior.resting is not None
 
 
 def is_kinked(distance: object) -> bool:

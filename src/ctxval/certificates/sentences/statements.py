@@ -234,7 +234,7 @@ def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
     return (
         complete,
         *([f"inputs act alike in every task: {acting.removeprefix('acting ')}"] if acting else []),
-        *([f"{friction} is the same everywhere, in both directions and after any time at rest"] if friction else []),
+        *([f"{friction} is the same everywhere and after any time at rest"] if friction else []),
         alike,
         f"{prior}; its hyperparameters are unknown and integrated over",
         *(_WITHOUT_DATA if evidence.without_data else ()),
@@ -291,7 +291,7 @@ def conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
     return [
         complete,
         *([f"the inputs {acting} in every task, as in the executions"] if acting else []),
-        *([f"{friction} being the same everywhere, in both directions and after any time at rest"] if friction else []),
+        *([f"{friction} being the same everywhere and after any time at rest"] if friction else []),
         alike,
         "its dynamics in the gaps of the records being like those beside the gaps (at most "
         f"{with_units(details['resolution'])} wide in single coordinates, wider in several at once)",
