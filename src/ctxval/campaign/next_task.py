@@ -65,8 +65,8 @@ def next_task(
     rank = evidence.rank(confidence)
     highest = evidence.points[[*order[rank::-1], *order[:rank:-1]]]
     if evidence.friction:  # one execution at the least friction at rest that nears the limit rules out all larger ones
-        nears = evidence.maxima > best + _NEARS * (limit - best)
-        highest = evidence.points[np.argsort(np.where(nears, evidence.maxima, np.inf), kind="stable")]
+        first = int(np.searchsorted(evidence.maxima[order], best + _NEARS * (limit - best), side="right"))
+        highest = evidence.points[[*order[first:], *order[:first][::-1]]]
     farthest, largest = evidence.coverage.task[None], evidence.elites
     exceeds = evidence.upper(confidence) > limit
     # Every third execution leads farthest from the records in any case, but friction is known where they are dense.

@@ -137,10 +137,10 @@ class DryFriction:
             withstood = np.abs(holding[:, j]) - self.load[j] * np.abs(u[:, j])
             # A held joint creeps, and rates below what little of the force changes cannot be told apart.
             little = np.maximum(usual[j], _LITTLE * withstood) * np.abs(of_rates[:, j, j])
-            slow = np.maximum(little, 2 * self.creep[j] * withstood)
-            first, last = np.abs(before[:, j]), np.abs(after[:, j])
+            creeping, first, last = self.creep[j] * withstood, np.abs(before[:, j]), np.abs(after[:, j])
+            slow, held = np.maximum(little, 2 * creeping), np.maximum(first, last) <= np.maximum(little, creeping)
             for i, pushed in enumerate((holding[:, j] <= 0, holding[:, j] > 0)):
-                most = float(withstood[pushed & (first <= slow) & (last <= slow)].max(initial=0.0))
+                most = float(withstood[pushed & held].max(initial=0.0))
                 least[i, j] = max(self.sliding[j], most - usual[j])
                 started = pushed & (first <= slow) & (last > np.maximum(2 * little, slow)) & (withstood > most)
                 largest[i, j] = max(least[i, j], withstood[started].min(initial=largest[i, j]) + usual[j])
