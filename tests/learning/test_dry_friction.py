@@ -181,6 +181,12 @@ def test_a_joint_that_creeps_while_it_is_held_is_found_to_do_so() -> None:
     assert friction.sliding[0] == pytest.approx(GRIP, rel=0.02)
     assert friction.creep[0] == pytest.approx(0.006 / (1 - 0.006 / DT), rel=0.02)  # for a unit of friction
     np.testing.assert_allclose(friction.step(resting, u[200:, None]), creeping(resting, u[200:, None]), atol=6e-4)
+    # A joint that moves faster than it could creep is not held.
+    start, push = np.array([[0.3, 0.0]]), np.array([[0.95]])
+    begun = np.concatenate([x, start]), np.concatenate([u[:, None], push])
+    least, *_ = friction.resting(Transitions(*begun, creeping(*begun)), lambda acting: np.zeros_like(begun[0]))
+    assert creeping(start, push)[0, 1] < 2 * 0.006 * 0.95
+    assert least[:, 0] == pytest.approx(GRIP, rel=0.02)
     # A joint that begins to creep does not move yet.
     start, push = np.array([[0.3, 0.0]]), np.array([[2.0]])
     x, u = np.concatenate([x, start]), np.concatenate([u[:, None], push])
