@@ -75,8 +75,8 @@ campaigns were validated falsely, on 16 of these systems. The present version bo
 direction, by what joints withstood and what set them in motion. It was developed on five of the 16 (breakaway, lugre,
 xy-breakaway, breakaway-final, seal-lip), and of all these campaigns, those are still validated falsely whose friction
 at rest is larger at one place, which the verdict says that it rests on. How tasks are chosen with it was developed on
-cylinder, rotary-seal, sealed-table and xy-table. Lip-seal, sealed-gantry and sealed-lift were written after it, and not tuned
-on.)
+cylinder, rotary-seal, sealed-table and xy-table. Lip-seal, sealed-gantry and sealed-lift were written after it, and
+not tuned on.)
 
 **At 1.25 d\\*, {found} campaigns on the other systems with friction of a kind that is learned were validated; without
 looking for friction, {before}. With seals, {sealed} were, {sealed_developed} on those that the choice of tasks was
