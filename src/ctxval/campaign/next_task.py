@@ -56,6 +56,7 @@ def next_task(
     These come first: a task whose predicted distance exceeds the limit; the task of the draw that sets the bound,
     while the bound exceeds the limit; the task that leads farthest from the records, while they leave gaps; and
     the task with the largest predicted distance, while no similar distance was executed or a deeper search found it.
+    With dry friction, the draw whose distance nears the limit with the least takes the place of the one at the bound.
     Further tasks test the predictions, and if all of these are known, the task that is farthest from all others does.
 
     The known tasks ``(n, d)`` are executed or open, ``best`` is the largest executed distance, and ``limit`` is what

@@ -234,16 +234,16 @@ class WorstCaseSearch:
                 maxima = _finite(self.planner.own_distances(settled, points[:, None]))[:, 0]
             # The largest share that the distance of an elite loses at the median of the tasks next to it. If
             # controllers jump from task to task, the largest distance is a needle that a search finds by chance. Kinks
-            # are no needles: they are flat between tasks that are nearer.
+            # are no needles: they are flat between tasks that are nearer. Nor is a task at which a joint is just held,
+            # like those on one side of it.
             peaks = of_mean.elites[: 0 if self.members is not None else self.settings.peaks]
             near = _NEARBY / _NEARER if is_kinked(self.planner.validation.distance) else _NEARBY
             moves = rng.uniform(-near, near, (len(peaks), self.settings.nearby, self.dimension))
             beside = np.concatenate([peaks[:, None], np.clip(peaks[:, None] + moves, 0, 1)], axis=1)
             flat = self._distances(posterior.mean, beside.reshape(-1, self.dimension))[0]
             distances = np.maximum(flat.reshape(beside.shape[:2]), 0.0)
-            # Where a joint may be held, distances jump, but a task there is like those on one side of it.
-            peak, share = distances[:, 0], 0.9 if _sticks(posterior) else 0.5
-            next_to_it = np.quantile(distances[:, 1:], share, axis=1)
+            peak = distances[:, 0]
+            next_to_it = np.quantile(distances[:, 1:], 0.9 if _sticks(posterior) else 0.5, axis=1)
             lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
         sharpness = float(max(lost.max(initial=0.0), 0.0))
         return replace(of_mean.with_draws(maxima, points, loops, draws.left_out), sharpness=sharpness)
