@@ -147,7 +147,7 @@ def make_validation_without_inputs(batched: bool = True) -> Validation:
         space=TaskSpace(a=(0.0, 1.0), b=(0.5, 1.0)),
         task=lambda p: Task(np.stack([p.a, p.b], axis=-1), goal=[0.0, 0.0], horizon=20, dt=0.1),
         system=systems.Simulated(lambda x, u: x @ A.T, vectorized=True),
-        model=lambda x, u: x @ M.T,
+        model=models.Function(lambda x, u: x @ M.T, vectorized=True),
         synthesizer=NoInput(batched),
         distance=distances.MaximumDeviation(),
     )

@@ -79,13 +79,13 @@ def _require_place(text: str, module: str, home: str) -> None:
         other = f"none of this name is in {home} or installed" if place is None else f"the reference means {place}"
         raise InputError(clash.format(text, module, used, other))
     # No loaded module of another experiment's folder may have the name of any module in this folder.
-    others = _added - {home}
-    for name, each in list(sys.modules.items()):
-        used = getattr(each, "__file__", None)
-        folder = os.path.dirname(used or "")
-        apart = "." in name or used is None or not {folder, os.path.dirname(folder)} & others
-        if not apart and PathFinder.find_spec(name, [home]) is not None:
-            raise InputError(clash.format(text, name, used, f"there is one in {home} too"))
+    if others := _added - {home}:
+        for name, each in list(sys.modules.items()):
+            used = getattr(each, "__file__", None) if "." not in name else None
+            folder = os.path.dirname(used or "")
+            apart = used is None or not {folder, os.path.dirname(folder)} & others
+            if not apart and PathFinder.find_spec(name, [home]) is not None:
+                raise InputError(clash.format(text, name, used, f"there is one in {home} too"))
 
 
 def _place(file: str | None, folders: Any) -> str | None:
