@@ -13,6 +13,7 @@ from rich.console import Console
 from ctxval._util import progress as progress_display
 from ctxval._util.cores import can_fork, on_all_cores
 from ctxval._util.progress import (
+    OnScreen,
     Progress,
     advance,
     also_listening,
@@ -189,6 +190,18 @@ def test_a_screen_keeps_all_notes_and_forgets_the_stages(monkeypatch: pytest.Mon
     assert isinstance(screen.file, io.StringIO)
     erased = screen.file.getvalue().rpartition("executions")[2]
     assert "\x1b[2K" in erased
+
+
+def test_the_clock_of_a_stage_runs_whatever_is_known_of_its_length(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress_display, "_DELAY", 0.0)
+    now = iter(range(10_000))
+    monkeypatch.setattr("time.monotonic", lambda: float(next(now)))
+    for expected in (None, 100, 300):
+        shown = OnScreen(console(terminal=True))
+        for done in (0, 250, 260, 350):
+            shown(Progress("searching", done, expected if expected is None or done <= expected else None, "loops"))
+        (task,) = shown._bars.tasks
+        assert (task.finished, task.total, task.completed) == (False, None, 350)
 
 
 def test_a_short_stage_is_not_shown() -> None:

@@ -366,12 +366,12 @@ def with_cell(line: int, column: int, text: str) -> Any:
         (with_cell(1, 0, "t [ms]"), "must have steps of 0.1 s: time 1 must be 0.1 s after the first, got 0.0001 s"),
         (
             lambda rows: [rows[0], *([str(100 * k), *row[1:]] for k, row in enumerate(rows[1:]))],
-            "if the times are in ms, name their column t [ms]",
+            "if the times are in ms, convert them to s, name their column t [ms]",
         ),
         (with_cell(5, 1, "-999"), "position is -999 at 0.3 s, far from all other values, which stands for a missing"),
         (with_cell(7, 1, "1,5"), "line 7: position [m] must be a number, got '1,5'"),
         (without(0), "must have the columns t, position [m], speed [m/s], force [N]"),
-        (lambda rows: rows[:15], "must have 21 times, 20 steps of 0.1 s, got 14 with steps of 0.1 s; --resample"),
+        (lambda rows: rows[:15], "must have 21 times, 20 steps of 0.1 s, got 14 with steps of 0.1 s."),
         (lambda rows: rows[:1], "must have a header and at least two rows"),
         (with_cell(5, 1, "n/a"), "run.csv, line 5: position [m] must be a number, got 'n/a'"),
         (with_cell(5, 1, ""), "run.csv, line 5: position [m] must be a number, and the cell is empty"),
@@ -593,7 +593,8 @@ def test_a_little_jitter_is_refused_with_its_size_and_the_option_that_helps(invo
     record(new(invoke)["folder"])
     edit(lambda rows: [rows[0], *([str(0.1 * k + 0.0025 * (k % 2)), *row[1:]] for k, row in enumerate(rows[1:]))])
     sentence = refused(invoke("tell", "a.sqlite", "0", "--trajectory", "run.csv"))
-    assert "The largest difference is 0.0025 s; --resample interpolates a recording to these times" in sentence
+    advice = "if it is a recording, --resample of `ctxval tell` interpolates it to these times"
+    assert f"The largest difference is 0.0025 s; {advice}" in sentence
     assert invoke("tell", "a.sqlite", "0", "--trajectory", "run.csv", "--resample").exit_code == 0
 
 

@@ -76,7 +76,7 @@ def test_a_forecast_speaks_in_words() -> None:
     assert "falsified in 90 %" in str(Forecast(1, 0.0, 0.9))
     fewest = Forecast(1, 0.95, 0.05, fewest=True)
     assert str(fewest).startswith(
-        "at least 1 more execution is needed to validate it, and 95 % of the posterior samples"
+        "at least 1 more execution is needed to validate it; so far, 95 % of the posterior samples"
     )
     assert str(fewest).endswith("stay below the threshold")
     above = "the learned dynamics expect a distance above the threshold: 2 % of the posterior samples of the dynamics"

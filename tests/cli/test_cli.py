@@ -271,7 +271,7 @@ def test_a_campaign_that_cannot_go_on_exits_with_3(invoke) -> None:  # type: ign
 def test_an_interrupt_says_how_to_go_on(invoke) -> None:  # type: ignore[no-untyped-def]
     result = invoke("run", "rig:slow")
     assert result.exit_code == 130
-    assert "run the same command to resume" in result.stderr
+    assert "the same command continues from them" in result.stderr
 
 
 @pytest.mark.thorough

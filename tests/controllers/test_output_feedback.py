@@ -73,5 +73,5 @@ def test_bad_arguments_are_refused() -> None:
         feedback(process=0.0)
     with pytest.raises(ShapeError, match=r"measurement must be a number or have shape \(1,\), got \(2,\)"):
         feedback(measurement=[1.0, 1.0]).design(cart(1.0), CART)
-    with pytest.raises(ShapeError, match="goal or reference of a task must have 1 components, got 2"):
+    with pytest.raises(ShapeError, match="goal or reference of a task must have 1 components, as the outputs, got 2"):
         feedback().design(cart(1.0, 2), CART)

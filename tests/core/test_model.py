@@ -175,3 +175,10 @@ def test_a_step_of_another_shape_is_named() -> None:
     wrong = Function(lambda x, u: np.zeros((*x.shape[:-1], 3)), vectorized=True)
     with pytest.raises(ModelError, match=r"step of the model must return states of shape \(12, 2\), got \(12, 3\)"):
         linearize(wrong, np.zeros((4, 2)), np.zeros((4, 1)))
+
+
+def test_complex_states_are_refused() -> None:
+    for function in (Function(lambda x, u: x + 1j), Function(lambda x, u: x + 1j, vectorized=True)):
+        for x in (np.zeros(2), np.zeros((3, 2))):
+            with pytest.raises(InputError, match="must return real numbers, got complex ones"):
+                function.step(x, x[..., :1])

@@ -173,7 +173,9 @@ def test_batches_of_outputs_are_exact_if_those_of_the_system_are_and_no_function
 @pytest.mark.parametrize("goal", [[0.3, 0.0], [0.3, 0.0, 0.0]])
 def test_goals_are_outputs(goal: list[float]) -> None:
     validation = swing_validation(task=lambda p: Task([0.2, 0.0], goal=goal, horizon=H, dt=DT))
-    with pytest.raises(ShapeError, match=f"goal or reference of a task must have 1 components, got {len(goal)}"):
+    with pytest.raises(
+        ShapeError, match=f"goal or reference of a task must have 1 components, as the outputs, got {len(goal)}"
+    ):
         validation.plan([0.5])
 
 

@@ -116,7 +116,9 @@ def test_a_component_that_is_no_number_is_refused_by_its_place() -> None:
 def test_a_goal_or_reference_of_another_width_is_refused_with_both(aim: dict[str, object]) -> None:
     other = task(**aim)
     other.require_width(3)
-    with pytest.raises(ShapeError, match="goal or reference of a task must have 2 components, got 3"):
+    with pytest.raises(
+        ShapeError, match="goal or reference of a task must have 2 components, as its initial_state, got 3"
+    ):
         other.require_width(2)
 
 

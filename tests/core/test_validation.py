@@ -358,11 +358,15 @@ def stopped(whole: Trajectory) -> Trajectory:
         (raising(TimeoutError()), r"^TimeoutError$"),
         (lambda whole: None, r"returned NoneType instead of a Trajectory"),
         (stopped, r"^emergency stop$"),
-        (lambda whole: Trajectory(whole.times, whole.states * np.nan, whole.inputs), "not finite"),
-        (lambda whole: Trajectory(whole.times, whole.states, whole.inputs * np.inf), "not finite"),
+        (lambda whole: Trajectory(whole.times, whole.states * np.nan, whole.inputs), r"not finite: \S+ is nan at 0 s"),
+        (lambda whole: Trajectory(whole.times, whole.states, whole.inputs * np.inf), "not finite: an input"),
+        (
+            lambda whole: Trajectory(whole.times, np.full_like(whole.states, 9.0), whole.inputs),
+            "All its states are equal: if the system's code changes one array in each step, record copies of it",
+        ),
         (
             lambda whole: Trajectory(whole.times[:-2], whole.states[:-2], whole.inputs[:-2]),
-            r"must have 13 times, 12 steps of 0.05 s, got 11",
+            r"must have 13 times, 12 steps of 0.05 s, got 11 with steps of 0.05 s.$",
         ),
         (
             lambda whole: Trajectory(whole.times, whole.states[:, :1], whole.inputs),

@@ -232,7 +232,8 @@ def test_one_file_in_another_unit_is_converted_or_refused(tmp_path: Path) -> Non
 def test_times_in_another_unit_than_seconds_are_never_interpolated() -> None:
     times = 20.0 * np.arange(1500)
     with pytest.raises(
-        InputError, match=r"every 20 s, and a step takes 0.02 s: if the times are in ms, name their col"
+        InputError,
+        match=r"every 20 s, and a step takes 0.02 s: if the times are in ms, convert them to s, name their col",
     ):
         recorded({"t": times, "x": times, "u": times}, dt=0.02)
     with pytest.raises(InputError, match=r"every 0.1 s, and a step takes 0.02 s: give dt = 0.1, or longest_gap if"):

@@ -171,7 +171,7 @@ def unit_advice(period: float, dt: float) -> str:
     for factor, unit in ((1e3, "ms"), (1e6, "us"), (1e9, "ns")):
         if 1 / FAR < period / dt / factor < FAR:
             mapped = f"or give time_unit = {unit!r} in a mapping"
-            return f"if the times are in {unit}, name their column t [{unit}], {mapped}"
+            return f"if the times are in {unit}, convert them to s, name their column t [{unit}], {mapped}"
         if 1 / FAR < period * factor / dt < FAR:
             return f"the times seem to be in s although they are stated in {unit}"
     return ""

@@ -181,10 +181,13 @@ class OnScreen:
         if progress.note:
             bars.console.print(_in_one_line(progress.note), soft_wrap=True, markup=False, highlight=False)
         if progress.depth not in self._rows:
-            self._rows[progress.depth] = bars.add_task(progress.stage, text="")
+            self._rows[progress.depth] = bars.add_task(progress.stage, total=None, text="")
         row = self._rows[progress.depth]
-        elapsed = bars.tasks[bars.task_ids.index(row)].elapsed or 0.0
-        bars.update(row, completed=progress.done, total=progress.expected, text=amount(progress, elapsed))
+        task = bars.tasks[bars.task_ids.index(row)]
+        if progress.expected is None:
+            task.total = None  # an update would keep an estimate that was too small
+        bars.update(row, completed=progress.done, total=progress.expected, text=amount(progress, task.elapsed or 0.0))
+        task.finished_time = None  # its clock runs until the stage ends
         if progress.ended:
             bars.remove_task(self._rows.pop(progress.depth))
             if not self._rows:

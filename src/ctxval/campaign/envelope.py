@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.progress import stage
+from ctxval._util.progress import advance, stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
@@ -19,7 +19,7 @@ from ctxval.certificates import dynamics_diagnostics as diagnostics
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.drawn_distances import DrawnDistances
 from ctxval.certificates.dynamics import Dynamics, draws_for
-from ctxval.certificates.dynamics_evidence import DynamicsEvidence
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
 from ctxval.certificates.envelope import (
     Envelope,
     boundary_tasks,
@@ -128,20 +128,20 @@ class EnvelopeSearch:
 
         Nothing was predicted of a test whose run leaves what these have recorded.
         """
-        tests, most = [], diagnostics.most_beyond(evidence)
-        for test in evidence.predictions:
-            if not test.stored or test.origin not in DRAWN:
-                continue
-            point = np.array(test.point)
-            same = np.flatnonzero((np.abs(learned.executed - point) <= _SAME_TASK).all(axis=1))
-            others = learned.without(same.tolist())
-            drawn = None if others is None else self._at(others, point[None])
-            median = upper = np.inf
-            if drawn is not None and drawn.known[0] and drawn.leaving(most)[0] <= 1:
-                median, upper = np.quantile(drawn.draws[:, 0], [0.5, 0.95]).tolist()
-            at = test.point if np.isfinite(median) else ()
-            changed = replace(test, median=median, upper=upper, quantiles=(), explained=None, point=at)
-            tests.append(changed)
+        most, tests = diagnostics.most_beyond(evidence), list[CheckedPrediction]()
+        stored = [test for test in evidence.predictions if test.stored and test.origin in DRAWN]
+        with stage("predicting each test without its own execution", len(stored), "tests"):
+            for test in stored:
+                point = np.array(test.point)
+                same = np.flatnonzero((np.abs(learned.executed - point) <= _SAME_TASK).all(axis=1))
+                others = learned.without(same.tolist())
+                drawn = None if others is None else self._at(others, point[None])
+                median = upper = np.inf
+                if drawn is not None and drawn.known[0] and drawn.leaving(most)[0] <= 1:
+                    median, upper = np.quantile(drawn.draws[:, 0], [0.5, 0.95]).tolist()
+                at = test.point if np.isfinite(median) else ()
+                tests.append(replace(test, median=median, upper=upper, quantiles=(), explained=None, point=at))
+                advance()
         return replace(evidence, predictions=tuple(tests))
 
     def reserved(self) -> Choice | None:

@@ -31,7 +31,7 @@ class Forecast:
             share = f"{100 * self.validated:.0f} % of the posterior samples of the dynamics stay below the threshold"
             if self.validated < 0.05:
                 return f"the learned dynamics expect a distance above the threshold: {share}"
-            return f"at least {self.executions} more {plural} needed to validate it, and {share}"
+            return f"at least {self.executions} more {plural} needed to validate it; so far, {share}"
         many = f"about {self.executions}" if self.executions is not None else f"more than {HORIZON}"
         shares = {"validated": self.validated, "falsified": self.falsified}
         answer = max(shares, key=lambda name: shares[name])

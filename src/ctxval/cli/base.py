@@ -93,6 +93,7 @@ def _described(parameter: inspect.Parameter, command: str, words: Mapping[str, A
     # The text itself names the kinds that most people need.
     kinds = (kind for kind in KINDS.built_in if kind not in ("auto", "posterior", "audit"))
     words = {**words, "searches": ", ".join(sorted(searches.REGISTRY.built_in)), "certificates": ", ".join(kinds)}
+    words["volumes"] = ", ".join(kind for kind in KINDS.built_in if not KINDS.find(kind).bounds_maximum)
     words["target"] = "CASE|FILE.toml|module:attr"
     known: dict[str, Any] = {"help": text} if isinstance(text, str) else text
     known = {key: value.format(**words) if isinstance(value, str) else value for key, value in known.items()}
@@ -126,7 +127,7 @@ def _run(function: Callable[[], Any], as_json: bool, stated: set[str]) -> None:
     except (typer.Exit, typer.Abort):
         raise
     except KeyboardInterrupt:
-        failure, status = "stopped. All executions are stored; run the same command to resume.", INTERRUPTED
+        failure, status = "stopped. All executions are stored; the same command continues from them.", INTERRUPTED
     except BaseException as error:  # users' code may raise anything
         if isinstance(error.__context__, BrokenPipeError):
             raise typer.Exit(CUT_OFF) from None  # the reader of the output has ended, as in `| head`

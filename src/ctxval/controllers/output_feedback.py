@@ -47,7 +47,7 @@ class OutputFeedback(ShortRepr):
 
     def design(self, task: Task, model: Model) -> EstimatedFeedback:
         n, p = task.initial_state.shape[-1], self.outputs(task.initial_state).shape[-1]
-        task.require_width(p)
+        task.require_width(p, "the outputs")
         zero = np.zeros(n)
         lift = np.linalg.pinv(self.outputs.jacobian(zero)).T
         reference = (task.reference - self.outputs(zero)) @ lift if task.has_goal else None

@@ -41,11 +41,18 @@ class Function(ShortRepr):
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         if self.vectorized or x.ndim == 1:
-            return np.asarray(self.function(x, u), dtype=np.float64)
+            return _real(self.function(x, u))
         states, inputs = paired(x, u)
         pairs = zip(rows_of(states), rows_of(inputs), strict=True)
-        rows = [np.asarray(self.function(xi, ui), dtype=np.float64) for xi, ui in pairs]
+        rows = [_real(self.function(xi, ui)) for xi, ui in pairs]
         return np.stack(rows).reshape(*states.shape[:-1], -1)
+
+
+def _real(states: object) -> Array:
+    array = np.asarray(states)
+    if array.dtype.kind == "c":  # numpy would drop the imaginary part
+        raise InputError("a step function must return real numbers, got complex ones.")
+    return np.asarray(array, dtype=np.float64)
 
 
 def paired(x: Array, u: Array) -> tuple[Array, Array]:

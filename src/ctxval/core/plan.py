@@ -66,10 +66,12 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
     if not near.all():
         i = int(np.argmin(near))
         wanted = f"{start[i]:g} within {within[i]:.3g}, got {trajectory.states[0, i]:g}"
-        raise InputError(
-            f"the trajectory starts elsewhere: state {i} must start at {wanted}. Check that it belongs to this trial; "
-            "if it does, a larger start_tolerance permits it."
-        )
+        advice = "Check that it belongs to this trial; if it does, a larger start_tolerance permits it."
+        if trajectory.horizon and ranges.any() and not np.ptp(trajectory.states, axis=0).any():
+            advice = (
+                "All its states are equal: if the system's code changes one array in each step, record copies of it."
+            )
+        raise InputError(f"the trajectory starts elsewhere: state {i} must start at {wanted}. {advice}")
 
 
 def recorded_before_failure(plan: Plan, trajectory: object, start_tolerance: float) -> Trajectory:

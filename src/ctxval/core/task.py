@@ -93,11 +93,11 @@ class Task:
         """The times of the states, shape ``(H + 1,)``, seconds."""
         return np.asarray(np.arange(self.horizon + 1) * self.dt)
 
-    def require_width(self, width: int) -> None:
-        """Refuse a goal or a reference that has another number of components."""
+    def require_width(self, width: int, like: str = "its initial_state") -> None:
+        """Refuse a goal or a reference that has another number of components than what it is compared with."""
         got = self.reference.shape[-1]
         if self.has_goal and got != width:
-            raise ShapeError(f"the goal or reference of a task must have {width} components, got {got}.")
+            raise ShapeError(f"the goal or reference of a task must have {width} components, as {like}, got {got}.")
 
     @staticmethod
     def stacked(tasks: Sequence[Task]) -> Task:

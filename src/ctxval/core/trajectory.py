@@ -265,7 +265,10 @@ def require_times(trajectory: Trajectory, times: Array) -> None:
     if (misses <= _TIMES * dt).all():
         return
     period = float(np.median(np.diff(recorded)))
-    advice = f"; {unit_advice(period, dt) or '--resample interpolates a recording to these times'}"
+    advice = unit_advice(period, dt)
+    if not advice and recorded[-1] >= times[-1] - _TIMES * dt:
+        advice = "if it is a recording, --resample of `ctxval tell` interpolates it to these times"
+    advice = f"; {advice}" if advice else ""
     if len(recorded) != len(times):
         got = f"{len(recorded)} with steps of {period:g} s{advice}"
         raise InputError(f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, got {got}.")

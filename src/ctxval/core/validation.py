@@ -137,7 +137,7 @@ class Validation:
         """Refuse a task whose goal or reference has other components than what is recorded."""
         with _failing_as(InputError, "the outputs h(x)"):
             width = self.recorded(task.initial_state).shape[-1]
-        task.require_width(width)
+        task.require_width(width, "its initial_state" if self.outputs is None else "the outputs")
 
     def recorded_task(self, task: Task) -> Task:
         """Return a task as who executes it knows it: with the outputs of its initial state, if there are any."""
@@ -198,7 +198,13 @@ class Validation:
         if trajectory.ended != COMPLETE:
             raise ExecutionError(trajectory.ended)
         if not trajectory.finite.all():
-            raise ExecutionError("the system's trajectory is not finite")
+            unknown = ~np.isfinite(trajectory.states)
+            what = "an input"
+            if unknown.any():
+                t, i = np.argwhere(unknown)[0]
+                names = [*self.names(trajectory.states.shape[-1], trajectory.inputs.shape[-1])[0]]
+                what = f"{names[i]} is {trajectory.states[t, i]:g} at {trajectory.times[t]:.4g} s"
+            raise ExecutionError(f"the system's trajectory is not finite: {what}")
         require_execution(plan, trajectory, self.start_tolerance if start_tolerance is None else start_tolerance)
         return trajectory
 

@@ -269,10 +269,18 @@ def test_a_model_is_learned_from_recorded_files(invoke: Any) -> None:
     steps = trajectory.transitions()
     np.savez("steps.npz", x=steps.x, u=steps.u, x_next=steps.x_next)
     assert len(recorded(["run1.csv", "run2.npz", "steps.npz"])) == 90
+    rows = zip(x.tolist(), [*u[:, 0].tolist(), 0.0], strict=True)
     matrices = "A = [[1.0, 0.05], [0.0, 1.0]]\nB = [[0.0], [0.05]]\n"
     settings = read_settings(changed((matrices, 'data = ["run1.csv", "run2.npz"]\n')), {})
     model = settings.load().validation.model
     np.testing.assert_allclose(model.A[0], [1, 0.05], atol=1e-9)  # type: ignore[attr-defined]
+    # Columns with the names of the experiment's states and inputs, one of them in another unit.
+    named = ["t,position [mm],speed,force", *(f"{0.05 * k},{1e3 * p},{v},{f}" for k, ((p, v), f) in enumerate(rows))]
+    Path("named.csv").write_text("\n".join(named))
+    names = {"position": "m", "speed": "m/s"}, {"force": "N"}
+    np.testing.assert_allclose(recorded(["named.csv"], None, names).x, steps.x, atol=1e-12)
+    with pytest.raises(InputError, match=r"name the states and inputs in \[states\] and \[inputs\] of the experiment"):
+        recorded(["named.csv"])
     for data in ("none.csv", "experiment_system.py", ["x.npz"], [], 3):
         with pytest.raises(InputError):
             recorded(data)
@@ -380,6 +388,21 @@ def test_noise_is_measured() -> None:
     state, text = findings(make_validation(system=Noisy(), horizon=5), execute=True)["execution"]
     assert state == "noted"
     assert "the system is stochastic" in text
+
+
+@pytest.mark.usefixtures("without_costs")
+def test_states_in_another_unit_are_noted() -> None:
+    plain = make_validation()
+
+    class InMillimetres:
+        def execute(self, controller: Any, task: Task) -> Trajectory:
+            whole = plain.system.execute(controller, task)
+            start = whole.states[0]
+            return Trajectory(whole.times, start + 1e3 * (whole.states - start), whole.inputs)
+
+    found = check_experiment(Experiment("x", make_validation(system=InMillimetres(), horizon=5)), execute=True)
+    texts = [finding.text for finding in found if finding.state == "noted"]
+    assert any("does the system return it in another unit?" in text for text in texts)
 
 
 @pytest.mark.usefixtures("without_costs")

@@ -28,8 +28,11 @@ REGISTRIES: dict[str, Registry[Any]] = {registry.kind: registry for registry in 
 """Where the parts that an experiment file describes are found, by the name of their table."""
 
 
-def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) -> Any:
-    """Return a system, model, synthesizer or distance."""
+Names = tuple[Mapping[str, str], Mapping[str, str]]  #: the states and the inputs of an experiment file, with units
+
+
+def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None, names: Names = ({}, {})) -> Any:
+    """Return a system, model, synthesizer or distance; ``names`` are looked for in recorded data of a model."""
     registry = REGISTRIES[kind]
     table = {"type": given} if isinstance(given, str) else dict(given)
     name = table.pop("type", None)
@@ -45,7 +48,7 @@ def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) 
         if isinstance(named, type) or (makes and not arguments and not accepts(named, 0)):
             require_part(registry, what, named)  # raises an error with the reason
         if isinstance(named, type) or makes:
-            named = _built(registry.kind, what, named, arguments, folder)
+            named = _built(registry.kind, what, named, arguments, folder, names)
         elif arguments:
             raise InputError(f"{what} is an object already, so it takes no arguments, got {', '.join(arguments)}.")
         return require_part(registry, what, named)
@@ -65,13 +68,14 @@ def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) 
     for key, value in arguments.items():
         if key in declared.functions and isinstance(table[key], Mapping) and not isinstance(value, Model):
             require_function(f"{key} of {what}", value, declared.functions[key])
-    return registry.require_made(name, _built(kind, what, build, arguments, folder))
+    return registry.require_made(name, _built(kind, what, build, arguments, folder, names))
 
 
-def _built(kind: str, what: str, build: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
+def _built(kind: str, what: str, build: Any, arguments: dict[str, Any], folder: Path | None, names: Names) -> Any:
     if kind == "model" and "data" in arguments and (hasattr(build, "fit") or declaration_of(build) is not None):
         # A part that cannot be learned here, such as a network, keeps the data, so that searches begin with them.
-        build, arguments = getattr(build, "fit", build), {**arguments, "data": recorded(arguments["data"], folder)}
+        data = recorded(arguments["data"], folder, names)
+        build, arguments = getattr(build, "fit", build), {**arguments, "data": data}
     return construct(what, build, arguments)
 
 
@@ -88,7 +92,7 @@ def argument(value: Any, folder: Path | None = None) -> Any:
     return value
 
 
-def recorded(files: Any, folder: Path | None = None) -> Transitions:
+def recorded(files: Any, folder: Path | None = None, names: Names = ({}, {})) -> Transitions:
     """Return the transitions in recorded trajectories, in logs, or in an NPZ file with x, u and x_next."""
     mapping = None
     if isinstance(files, Mapping):
@@ -107,7 +111,9 @@ def recorded(files: Any, folder: Path | None = None) -> Transitions:
             parts.append(stored)
         else:  # arrays in NPZ files have other names than columns
             logs.setdefault("" if mapping is not None else path.suffix, []).append(path)
-    return Transitions.joined([*parts, *(read_recordings(each, mapping).transitions()[0] for each in logs.values())])
+    of_names = {"states": names[0], "inputs": names[1]}
+    read = (read_recordings(each, mapping, **of_names) for each in logs.values())
+    return Transitions.joined([*parts, *(recordings.transitions()[0] for recordings in read)])
 
 
 @dataclass(frozen=True)

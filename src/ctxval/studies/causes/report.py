@@ -98,13 +98,11 @@ class CauseReport(ShortRepr):
     def sentence(self) -> str:
         """What M lacks, in one or two sentences."""
         units = f" {self.units}" if self.units else ""
+        none = f"None of the {self.tried} causes that were tried"
         if self.began_elsewhere and not self.named:
-            return (
-                f"None of these {self.tried} causes: M predicts the executions from where they began, and that is not "
-                "where their tasks begin."
-            )
+            return f"{none}: M predicts the executions from where they began, and that is not where their tasks begin."
         if not self.explained:
-            return f"None of these {self.tried} causes: none predicts executions better that it was not fitted to."
+            return f"{none}: none predicts executions better that it was not fitted to."
         first = self.explained[0]
         failed = " until they failed" if self.failed else ""
         if 0 < self.failed < self.executions:
@@ -122,7 +120,7 @@ class CauseReport(ShortRepr):
         if not self.named:
             less = "The largest part of the error that one explains" if first.share > 0.5 else "What comes nearest"
             effect = f"{'and' if falls else 'but'} {effect}"
-            return f"None of these {self.tried} causes. {less}: {self._text(first)}. It explains {share}, {effect}."
+            return f"{none}. {less}: {self._text(first)}. It explains {share}, {effect}."
         what = "One of these, which the executions do not tell apart: " if len(self.explained) > 1 else ""
         what += "; or ".join(map(self._text, self.explained))
         what += ", or all executions began there" if self.began_elsewhere else ""
