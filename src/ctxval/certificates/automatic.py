@@ -12,7 +12,7 @@ from ctxval._util.checked import NonNegativeInt, PositiveFloat, Probability
 from ctxval._util.registry import part
 from ctxval._util.representation import counted
 from ctxval.certificates.base import Certificate, CertificateKind
-from ctxval.certificates.covering import RESOLUTION, covering
+from ctxval.certificates.covering import RESOLUTION, covering, farthest_task
 from ctxval.certificates.dynamics import Dynamics
 from ctxval.certificates.dynamics_diagnostics import FEWEST, mostly_fail
 from ctxval.certificates.posterior import Posterior
@@ -88,6 +88,14 @@ class Automatic(CertificateKind):
                     return by_dynamics  # the posterior bound of the distance is about systems without noise
         if sample.suite is not None:
             return by_dynamics or WholeSuite().certify(sample, confidence)
+        preferred = False
+        if by_dynamics is not None:
+            preferred = _decides(by_dynamics, None) or bool(threshold and supported_by(by_dynamics, threshold))
+            # Predictions that hold decide sooner than executions next to every task, if that takes more than 100.
+            if not mostly_fail([each["held"] for each in by_dynamics.details["checked"]]):
+                preferred = preferred or covering(sample.points, self.resolution, 100) is None
+            if preferred and farthest_task(sample.points) > self.resolution:
+                return by_dynamics  # the posterior bound, which takes seconds, would be withdrawn
         try:
             certificate = Posterior(self.resolution).certify(sample, confidence)
         except CertificateError:
@@ -107,12 +115,7 @@ class Automatic(CertificateKind):
         certificate = replace(certificate, details=details, doubt=doubt)
         if by_dynamics is None or _decides(certificate, threshold):
             return certificate
-        supported = threshold is not None and supported_by(by_dynamics, threshold)
-        if _decides(by_dynamics, None) or supported:
-            return by_dynamics
-        # Predictions that hold decide sooner than executions next to every task, if that takes more than 100.
-        holding = [each["held"] for each in by_dynamics.details["checked"]]
-        if not mostly_fail(holding) and covering(sample.points, self.resolution, 100) is None:
+        if preferred:
             return by_dynamics
         suspect = by_dynamics.details["suspect"]
         return replace(certificate, details={**certificate.details, "suspect": suspect})

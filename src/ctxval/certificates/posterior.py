@@ -52,14 +52,19 @@ class Posterior(CertificateKind):
     def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
         """Return the bound that d* stays below with the confidence, and a forecast if it is above the threshold."""
         threshold = sample.threshold
+        far = (farthest := farthest_task(sample.points)) > self.resolution
         # Many trials that do not cover the tasks are refused before the draws, which take long.
-        if len(sample) > MOST and (farthest := farthest_task(sample.points)) > self.resolution:
+        if far and len(sample) > MOST:
             raise CertificateError(
                 f"some task is {farthest:.2g} of the task space's diagonal away from each of {len(sample)} trials, "
                 f"more than the resolution of {self.resolution:g}, so the bound would be withdrawn and is not "
                 f"computed; {withdrawals.AUDIT}."
             )
-        drawn = draw_maxima(sample) if threshold is None else settle_maxima(sample, threshold, confidence)
+        # A bound that is withdrawn in any case need not be told from the threshold.
+        if threshold is None or far:
+            drawn = draw_maxima(sample)
+        else:
+            drawn = settle_maxima(sample, threshold, confidence)
         certificate = self.certify_drawn(sample, drawn, confidence)
         if threshold is None or certificate.doubt is not None or certificate.upper_bound <= threshold:
             return certificate  # a process that the trials contradict predicts nothing
