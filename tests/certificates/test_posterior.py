@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -46,6 +47,18 @@ def test_a_certificate_says_its_error() -> None:
     assert "standard error of the random draws" in certificate.statement
     assert not certificate.covers(certificate.upper_bound)
     assert certificate.covers(certificate.upper_bound + 2.001 * certificate.error)
+
+
+def test_a_bound_that_a_far_task_withdraws_is_not_settled(monkeypatch: pytest.MonkeyPatch) -> None:
+    settled = []
+    monkeypatch.setattr(
+        "ctxval.certificates.posterior.settle_maxima", lambda *given: settled.append(1) or quick(given[0])
+    )
+    trials = sample()
+    bound = quick(trials).upper(0.9)
+    near, far = (Posterior(resolution).certify(replace(trials, threshold=bound), 0.9) for resolution in (1.0, 1e-3))
+    assert (near.doubt, settled) == (None, [1])
+    assert far.doubt is not None
 
 
 # What failed and what was made good

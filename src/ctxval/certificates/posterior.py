@@ -61,10 +61,7 @@ class Posterior(CertificateKind):
                 f"computed; {withdrawals.AUDIT}."
             )
         # A bound that is withdrawn in any case need not be told from the threshold.
-        if threshold is None or far:
-            drawn = draw_maxima(sample)
-        else:
-            drawn = settle_maxima(sample, threshold, confidence)
+        drawn = draw_maxima(sample) if threshold is None or far else settle_maxima(sample, threshold, confidence)
         certificate = self.certify_drawn(sample, drawn, confidence)
         if threshold is None or certificate.doubt is not None or certificate.upper_bound <= threshold:
             return certificate  # a process that the trials contradict predicts nothing
