@@ -358,7 +358,11 @@ def stopped(whole: Trajectory) -> Trajectory:
         (raising(TimeoutError()), r"^TimeoutError$"),
         (lambda whole: None, r"returned NoneType instead of a Trajectory"),
         (stopped, r"^emergency stop$"),
-        (lambda whole: Trajectory(whole.times, whole.states * np.nan, whole.inputs), r"not finite: \S+ is nan at 0 s"),
+        (
+            lambda whole: Trajectory(whole.times, whole.states * np.nan, whole.inputs),
+            "not finite: state 0 is nan at step 0",
+        ),
+        (lambda whole: Trajectory(whole.times, whole.states[None] * np.nan, whole.inputs[None]), "not finite: state 0"),
         (lambda whole: Trajectory(whole.times, whole.states, whole.inputs * np.inf), "not finite: an input"),
         (
             lambda whole: Trajectory(whole.times, np.full_like(whole.states, 9.0), whole.inputs),

@@ -198,12 +198,10 @@ class Validation:
         if trajectory.ended != COMPLETE:
             raise ExecutionError(trajectory.ended)
         if not trajectory.finite.all():
-            unknown = ~np.isfinite(trajectory.states)
-            what = "an input"
-            if unknown.any():
-                t, i = np.argwhere(unknown)[0]
-                names = [*self.names(trajectory.states.shape[-1], trajectory.inputs.shape[-1])[0]]
-                what = f"{names[i]} is {trajectory.states[t, i]:g} at {trajectory.times[t]:.4g} s"
+            unknown, what = np.argwhere(~np.isfinite(trajectory.states)), "an input"
+            if len(unknown):
+                place = tuple(unknown[0])  # of a batch, too, which is refused below if it is finite
+                what = f"state {place[-1]} is {trajectory.states[place]:g} at step {place[-2]}"
             raise ExecutionError(f"the system's trajectory is not finite: {what}")
         require_execution(plan, trajectory, self.start_tolerance if start_tolerance is None else start_tolerance)
         return trajectory

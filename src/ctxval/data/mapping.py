@@ -214,7 +214,8 @@ class LogMapping(ShortRepr):
         vectors = ("states", "x", "observation.state")
         usual = _usual(columns, vectors, "x"), _usual(columns, ("inputs", "u", "action"), "u")
         if not usual[0]:
-            how = "name the states and inputs in [states] and [inputs] of the experiment file, or in a mapping"
+            how = "name the states and inputs with --state and --input of a command that has them, in a mapping, or in "
+            how += "[states] and [inputs] of the experiment file"
             known = f"{', '.join(vectors)}, x0): {how}; the fields are {enumerated(columns, LISTED)}"
             raise InputError(f"{log.source} has no states under a usual name ({known}.")
         return LogMapping(*usual, dt=log.period)

@@ -279,7 +279,7 @@ def test_a_model_is_learned_from_recorded_files(invoke: Any) -> None:
     Path("named.csv").write_text("\n".join(named))
     names = {"position": "m", "speed": "m/s"}, {"force": "N"}
     np.testing.assert_allclose(recorded(["named.csv"], None, names).x, steps.x, atol=1e-12)
-    with pytest.raises(InputError, match=r"name the states and inputs in \[states\] and \[inputs\] of the experiment"):
+    with pytest.raises(InputError, match=r"\[states\] and \[inputs\] of the experiment file"):
         recorded(["named.csv"])
     for data in ("none.csv", "experiment_system.py", ["x.npz"], [], 3):
         with pytest.raises(InputError):
