@@ -222,9 +222,6 @@ def test_auto_uses_the_dynamics_if_they_decide_and_the_distance_otherwise() -> N
     assert alone.reason == judge(trials(9), 1.1, CertificateOptions(Posterior())).reason
 
 
-certify_drawn = Posterior.certify_drawn
-
-
 @pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize(
     ("dimension", "held", "kind"), [(2, True, "posterior"), (6, True, "dynamics"), (6, False, "posterior")]
@@ -232,7 +229,7 @@ certify_drawn = Posterior.certify_drawn
 def test_auto_says_what_the_dynamics_lack_if_too_many_executions_would_cover_the_tasks(
     dimension: int, held: bool, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    computed = []
+    computed, certify_drawn = [], Posterior.certify_drawn
     monkeypatch.setattr(Posterior, "certify_drawn", lambda *given: computed.append(1) or certify_drawn(*given))
     points = np.random.default_rng(3).random((9, dimension))
     executed = [replace(trial, unit_point=point) for trial, point in zip(trials(9), points, strict=True)]

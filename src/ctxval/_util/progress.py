@@ -184,9 +184,8 @@ class OnScreen:
             self._rows[progress.depth] = bars.add_task(progress.stage, total=None, text="")
         row = self._rows[progress.depth]
         task = bars.tasks[bars.task_ids.index(row)]
-        if progress.expected is None:
-            task.total = None  # an update would keep an estimate that was too small
-        bars.update(row, completed=progress.done, total=progress.expected, text=amount(progress, task.elapsed or 0.0))
+        task.total = progress.expected  # an update would keep an estimate that was too small
+        bars.update(row, completed=progress.done, text=amount(progress, task.elapsed or 0.0))
         task.finished_time = None  # its clock runs until the stage ends
         if progress.ended:
             bars.remove_task(self._rows.pop(progress.depth))

@@ -88,13 +88,19 @@ def command(name: str | None = None, /, *, with_json: bool = True, **words: Any)
     return register
 
 
+_WORDS = {
+    "searches": ", ".join(sorted(searches.REGISTRY.built_in)),
+    # The text itself names the kinds that most people need.
+    "certificates": ", ".join(kind for kind in KINDS.built_in if kind not in ("auto", "posterior", "audit")),
+    "volumes": ", ".join(kind for kind in KINDS.built_in if not KINDS.find(kind).bounds_maximum),
+    "target": "CASE|FILE.toml|module:attr",
+}
+"""What the texts of all commands are completed with."""
+
+
 def _described(parameter: inspect.Parameter, command: str, words: Mapping[str, Any]) -> inspect.Parameter:
     text = {**TEXTS["options"], **TEXTS.get(command, {})}[parameter.name]
-    # The text itself names the kinds that most people need.
-    kinds = (kind for kind in KINDS.built_in if kind not in ("auto", "posterior", "audit"))
-    words = {**words, "searches": ", ".join(sorted(searches.REGISTRY.built_in)), "certificates": ", ".join(kinds)}
-    words["volumes"] = ", ".join(kind for kind in KINDS.built_in if not KINDS.find(kind).bounds_maximum)
-    words["target"] = "CASE|FILE.toml|module:attr"
+    words = {**_WORDS, **words}
     known: dict[str, Any] = {"help": text} if isinstance(text, str) else text
     known = {key: value.format(**words) if isinstance(value, str) else value for key, value in known.items()}
     if "argument" in known:

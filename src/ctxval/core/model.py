@@ -50,7 +50,7 @@ class Function(ShortRepr):
 
 def _real(states: object) -> Array:
     array = np.asarray(states)
-    if array.dtype.kind == "c":  # numpy would drop the imaginary part
+    if np.iscomplexobj(array):  # numpy would drop the imaginary part
         raise InputError("a step function must return real numbers, got complex ones.")
     return np.asarray(array, dtype=np.float64)
 

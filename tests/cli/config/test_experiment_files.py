@@ -277,7 +277,7 @@ def test_a_model_is_learned_from_recorded_files(invoke: Any) -> None:
     # Columns with the names of the experiment's states and inputs, one of them in another unit.
     named = ["t,position [mm],speed,force", *(f"{0.05 * k},{1e3 * p},{v},{f}" for k, ((p, v), f) in enumerate(rows))]
     Path("named.csv").write_text("\n".join(named))
-    names = {"position": "m", "speed": "m/s"}, {"force": "N"}
+    names = {"states": {"position": "m", "speed": "m/s"}, "inputs": {"force": "N"}}
     np.testing.assert_allclose(recorded(["named.csv"], None, names).x, steps.x, atol=1e-12)
     with pytest.raises(InputError, match=r"\[states\] and \[inputs\] of the experiment file"):
         recorded(["named.csv"])

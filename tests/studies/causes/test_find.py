@@ -107,7 +107,7 @@ def test_a_fault_outside_of_the_dictionary_is_none_of_these() -> None:
     report = found(slide(lambda position, speed, stopping: 0.5 * np.sin(11 * position)))
     assert not report.named
     assert report.causes == ()
-    assert report.sentence.startswith("None of the ")
+    assert report.sentence.startswith(f"None of the {report.tried} causes that were tried")
     assert report.python is None
 
 

@@ -244,10 +244,9 @@ def _executions(validation: Validation, plans: Sequence[Plan], execute: bool) ->
         text = f"executions start up to {gap:.3g} away from the initial state of the task, which the start tolerance"
         yield "noted", f"{text} permits"
     spans = np.ptp(first.states, axis=0), np.ptp(plan.model_trajectory.states, axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        apart = ~(np.abs(np.log(spans[0] / spans[1])) < np.log(30)) & (spans[1] > 1e-9) & (spans[0] > 1e-9)
-    for i in np.flatnonzero(apart)[:1]:
-        name = [*validation.names(len(apart), first.inputs.shape[-1])[0]][i]
+    low, high = np.sort(spans, axis=0)
+    for i in np.flatnonzero((low > 1e-9) & (high >= 30 * low))[:1]:
+        name = [*validation.names(len(low), first.inputs.shape[-1])[0]][i]
         text = f"{name} changes by {spans[0][i]:.3g} in an execution and by {spans[1][i]:.3g} on the model"
         yield "noted", f"{text}: does the system return it in another unit?"
     noise = float(np.abs(first.states - second.states).max())

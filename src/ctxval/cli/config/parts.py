@@ -28,10 +28,10 @@ REGISTRIES: dict[str, Registry[Any]] = {registry.kind: registry for registry in 
 """Where the parts that an experiment file describes are found, by the name of their table."""
 
 
-Names = tuple[Mapping[str, str], Mapping[str, str]]  #: the states and the inputs of an experiment file, with units
+Names = Mapping[str, Mapping[str, str]]  #: the ``states`` and the ``inputs`` of an experiment file, with units
 
 
-def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None, names: Names = ({}, {})) -> Any:
+def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None, names: Names | None = None) -> Any:
     """Return a system, model, synthesizer or distance; ``names`` are looked for in recorded data of a model."""
     registry = REGISTRIES[kind]
     table = {"type": given} if isinstance(given, str) else dict(given)
@@ -71,7 +71,9 @@ def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None, 
     return registry.require_made(name, _built(kind, what, build, arguments, folder, names))
 
 
-def _built(kind: str, what: str, build: Any, arguments: dict[str, Any], folder: Path | None, names: Names) -> Any:
+def _built(
+    kind: str, what: str, build: Any, arguments: dict[str, Any], folder: Path | None, names: Names | None
+) -> Any:
     if kind == "model" and "data" in arguments and (hasattr(build, "fit") or declaration_of(build) is not None):
         # A part that cannot be learned here, such as a network, keeps the data, so that searches begin with them.
         data = recorded(arguments["data"], folder, names)
@@ -92,7 +94,7 @@ def argument(value: Any, folder: Path | None = None) -> Any:
     return value
 
 
-def recorded(files: Any, folder: Path | None = None, names: Names = ({}, {})) -> Transitions:
+def recorded(files: Any, folder: Path | None = None, names: Names | None = None) -> Transitions:
     """Return the transitions in recorded trajectories, in logs, or in an NPZ file with x, u and x_next."""
     mapping = None
     if isinstance(files, Mapping):
@@ -111,8 +113,7 @@ def recorded(files: Any, folder: Path | None = None, names: Names = ({}, {})) ->
             parts.append(stored)
         else:  # arrays in NPZ files have other names than columns
             logs.setdefault("" if mapping is not None else path.suffix, []).append(path)
-    of_names = {"states": names[0], "inputs": names[1]}
-    read = (read_recordings(each, mapping, **of_names) for each in logs.values())
+    read = (read_recordings(each, mapping, **(names or {})) for each in logs.values())
     return Transitions.joined([*parts, *(recordings.transitions()[0] for recordings in read)])
 
 

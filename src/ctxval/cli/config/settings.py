@@ -204,9 +204,8 @@ class ExperimentSettings(BaseModel, extra="forbid"):
             default = {"type": "MaximumDeviation", "components": (self.spec.model_extra or {}).get("components")}
         task = parts.task_function(self.task or {}, space, system, self.folder)
         tables = {"model": self.model, "synthesizer": self.synthesizer, "distance": self.distance or default}
-        made = {
-            kind: part(kind, table or {}, self.folder, (self.states, self.inputs)) for kind, table in tables.items()
-        }
+        names = {"states": self.states, "inputs": self.inputs}
+        made = {kind: part(kind, table or {}, self.folder, names) for kind, table in tables.items()}
         labels = Labels(labels_of(self.states), labels_of(self.inputs), self.units or "")
         validation = Validation(space=space, task=task, system=system, labels=labels, outputs=outputs, **made)
         if isinstance(task, parts.TaskTable):
