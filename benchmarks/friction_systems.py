@@ -16,8 +16,8 @@ DEVELOPMENT = ("geared-pendulum", "ball-screw", "loaded-gear", "frictionloss-arm
 """Systems that the method was developed on."""
 REGULAR = ("cart-pole", "gantry", "scara", "harmonic-drive", "xy-table")
 """Others whose friction is of a kind that is learned."""
-OTHERS = ("worn-guide", "two-way-ratchet")
-"""Others whose friction changes with the place or the direction."""
+OTHERS = ("worn-guide", "two-way-ratchet", "detent-rail")
+"""Others whose friction changes with the place or the direction; of the last one, at rest."""
 DEVELOPED_AT_REST = ("cylinder", "rotary-seal", "sealed-table")
 """Others, whose friction is larger at rest than at any rate, which only the smallest moves show.
 
@@ -158,10 +158,13 @@ def loaded_gear(share: float, friction: float) -> Push:
     return lambda q, w, u: u - 0.5 * w - (friction + share * np.abs(u)) * coulomb(w)
 
 
-def sealed(push: Push, sliding: Array, rest: Array, back: Array, dt: float, substeps: int = 40) -> models.Function:
+def sealed(
+    push: Push, sliding: Array, rest: Array, back: Array, dt: float, substeps: int = 40, detent: float | None = None
+) -> models.Function:
     """Return joints that rest until a force overcomes more than they slide with; push is without friction.
 
-    They rest against pushes above 0 up to ``rest``, and against those below 0 up to ``back``.
+    They rest against pushes above 0 up to ``rest``, and against those below 0 up to ``back``; next to a detent, up to
+    three times as much.
     """
 
     def step(x: Array, u: Array) -> Array:
@@ -169,6 +172,8 @@ def sealed(push: Push, sliding: Array, rest: Array, back: Array, dt: float, subs
         places, speeds = x[..., :k], x[..., k:]
         free = speeds + h * push(places, speeds, u)
         grips = np.where(speeds == 0, np.where(free > 0, rest, back), sliding)
+        if detent is not None:
+            grips = np.where((speeds == 0) & (np.abs(places - detent) < 0.06), 3 * grips, grips)
         speeds = np.sign(free) * np.maximum(np.abs(free) - h * grips, 0.0)
         return np.concatenate([places + h * speeds, speeds], axis=-1)
 
@@ -208,7 +213,7 @@ def _moves(unit: str, start: float, goal: float, *, of: str = "") -> dict[str, t
 
 def with_seals(
     name: str, units: str, space: TaskSpace, push: Push, sliding: object, rest: object,
-    Q: list[float], R: float, inputs: int = 1, back: object = None,
+    Q: list[float], R: float, inputs: int = 1, back: object = None, detent: float | None = None,
 ) -> Experiment:  # fmt: skip
     """Return an experiment with friction that is larger at rest, which M lacks, and joints 5 % heavier than in M."""
 
@@ -216,7 +221,8 @@ def with_seals(
         return push(q, w, u) / 1.05
 
     dt, places = 0.04, tuple(range(inputs))
-    joints = sealed(heavier, np.asarray(sliding), np.asarray(rest), np.asarray(rest if back is None else back), dt)
+    limits = (np.asarray(each) for each in (sliding, rest, rest if back is None else back))
+    joints = sealed(heavier, *limits, dt, detent=detent)
     return pair(name, units, space, joints, push, 60, dt, Q, R, places, inputs)
 
 
@@ -258,6 +264,10 @@ SYSTEMS: dict[str, Callable[[], Experiment]] = {
     "two-way-ratchet": lambda: axis("two-way-ratchet", two_way_ratchet, 0.7, 0.4),
     "cylinder": lambda: with_seals(
         "cylinder", "m", TaskSpace(**_moves("m", 1.0, 1.5)), ball_screw(0.0, 0.0), 0.5, 0.8, [12.0, 1.0], 0.6,
+    ),
+    "detent-rail": lambda: with_seals(
+        "detent-rail", "m", TaskSpace(**_moves("m", 0.8, 1.6)),
+        ball_screw(0.0, 0.0), 0.3, 0.4, [15.0, 1.5], 0.5, detent=0.5,
     ),
     "rotary-seal": lambda: with_seals(
         "rotary-seal", "rad", TaskSpace(**_moves("rad", 0.8, 1.2)),

@@ -125,6 +125,31 @@ def _battery(x: Array, u: Array, goal: Array, memory: Any, rng: np.random.Genera
     return _moved(x, strength * u[..., 0] - _drag(x)) + _noise(x, rng), strength
 
 
+def _bump(x: Array, u: Array, goal: Array, memory: Any, rng: np.random.Generator, t: int) -> tuple[Array, Any]:
+    """In an eighth of the goals, a quarter of the executions meet a bump."""
+    hit = rng.random(x.shape[:-1]) < 0.25 if memory is None else memory
+    bump = 0.2 * (hit & (goal > 0.5) & (goal < 1.0) & (np.abs(t - 20) < 4))
+    return _moved(x, u[..., 0] - _drag(x)) + _noise(x, rng) + np.stack([0 * bump, bump], axis=-1), hit
+
+
+def _wet(x: Array, u: Array, goal: Array, memory: Any, rng: np.random.Generator, t: int) -> tuple[Array, Any]:
+    """One execution of eight is on a wet floor, where the wheels slip."""
+    wet = rng.random(x.shape[:-1]) < 0.125 if memory is None else memory
+    return _moved(x, np.where(wet, 0.6, 1.0) * u[..., 0] - _drag(x)) + _noise(x, rng), wet
+
+
+def _zeroed(x: Array, u: Array, goal: Array, memory: Any, rng: np.random.Generator, t: int) -> tuple[Array, Any]:
+    """The force has another offset in each execution."""
+    offset = 0.15 * rng.standard_normal(x.shape[:-1]) if memory is None else memory
+    return _moved(x, u[..., 0] + offset - _drag(x)) + _noise(x, rng), offset
+
+
+def _weak(x: Array, u: Array, goal: Array, memory: Any, rng: np.random.Generator, t: int) -> tuple[Array, Any]:
+    """Without noise: in a twentieth of the goals, the motor has 12 % less strength."""
+    gain = np.where((goal > 1.7) & (goal < 1.9), 0.88, 1.0)
+    return _moved(x, gain * u[..., 0] - _drag(x)), memory
+
+
 @dataclass(frozen=True)
 class MisleadingPlant(Plant):
     """A cart that misleads.
@@ -146,6 +171,10 @@ _CART = DEVELOPMENT["cart"]
 PLANTS = {
     name: MisleadingPlant(name, _CART.make, _CART.step, _CART.ranges, step)
     for name, step in {
+        "weak": _weak,
+        "bump": _bump,
+        "wet": _wet,
+        "zeroed": _zeroed,
         "corner": _corner,
         "coloured": _coloured,
         "gusts": _gusts,

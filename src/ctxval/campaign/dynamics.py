@@ -19,6 +19,7 @@ from ctxval.campaign.storage.store import Store
 from ctxval.certificates.dynamics import bound_of, draws_for
 from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, failed, jumps
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
+from ctxval.certificates.explained import ExplainedExecution
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory
@@ -192,9 +193,14 @@ class CampaignDynamics:
         evidence = self._evidence(learned, trials, learned.worst_case_of(draws), **known)
         best, further = Trials(trials).largest, dict[str, Any]()
         bound = bound_of(evidence, best, confidence)
+        further["executed"] = self._explained(learned, trials)
+        further["influential"] = None if learned.influential is None else tuple(learned.influential.tolist())
+        further |= {"drift": learned.drift, "uneven": learned.uneven_friction}
         if failed(evidence, bound) is not None:
             further["suspect"] = learned.study.suspected_parameter(learned)
-        if doubt_of(replace(evidence, tests=0), best, bound):  # how many tests a verdict needs is not known here
+        if doubt_of(
+            replace(evidence, tests=0, **further), best, bound
+        ):  # how many tests a verdict needs is not known here
             return replace(evidence, **further)
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         jump = learned.study.search.largest_jump(drawn_from)
@@ -210,6 +216,23 @@ class CampaignDynamics:
         if learned.noisy is None:  # a push is compared with residuals of state and input, which do not hold with noise
             further["pushed"] = learned.push_response
         return replace(evidence, **further)
+
+    def _explained(self, learned: LearnedDynamics, trials: Sequence[Trial]) -> tuple[ExplainedExecution, ...]:
+        """Return all executions beside what they teach."""
+        executed, points = executed_trials(self._store, trials), learned.executed
+        noisy = learned.noisy is not None and learned.noisy.is_noisy
+        expected = [] if noisy else np.nan_to_num(learned.expected(points), nan=np.inf).tolist()
+        predictions, explained = learned.predictions(points) if noisy else [None] * len(points), []
+        for k, ((trial, trajectory), prediction) in enumerate(zip(executed, predictions, strict=True)):
+            distance, at = trial.distance or 0.0, tuple(trial.unit_point.tolist())
+            if not noisy:
+                explained.append(ExplainedExecution(trial.number, at, distance, expected[k]))
+            elif prediction is not None and prediction.noise is not None:
+                score, noise = prediction.score(trajectory, distance), prediction.noise
+                p_values = () if score is None else score.p_values
+                law = prediction.median, noise.distances, noise.runs, p_values
+                explained.append(ExplainedExecution(trial.number, at, distance, *law))
+        return tuple(explained)
 
     def _evidence(
         self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase, noise: float = 0.0, **known: Any

@@ -169,7 +169,7 @@ class EnvelopeSearch:
         known = self._known(trials)
         if known is None:
             return None
-        explained = all(diagnostics.is_explained(each, self._threshold) for each in known[1].predictions)
+        explained = all(diagnostics.is_explained(known[1], each, self._threshold) for each in known[1].predictions)
         regular = None if known[1].quantile is None and explained else self._regular(trials, known[1])
         learned, evidence = regular or known
         missing = diagnostics.missing_tests(evidence.predictions, evidence.tests)

@@ -31,6 +31,7 @@ from ctxval.certificates.dynamics_diagnostics import (
     FEWEST,
     doubt_of,
     held,
+    holds,
     is_explained,
     missing_tests,
     mostly_fail,
@@ -39,15 +40,18 @@ from ctxval.certificates.dynamics_diagnostics import (
     raised,
     unentered_pocket,
 )
+from ctxval.certificates.explained import CONTRADICTED, LEVERAGE, evidence_against, least_explained
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import Posterior
-from ctxval.certificates.prediction_tests import DRAWN, MANY, TESTS
+from ctxval.certificates.prediction_tests import DRAWN, HYPERCUBE, MANY, TESTS, hypercube_in
 from ctxval.certificates.sample import SAME
 from ctxval.certificates.verdict import counterexample, require_suite
 from ctxval.core.trial import Trial, Trials
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.worst_case import is_kinked
 
+_HYPERCUBES = 128  # from which the one that is executed is chosen
+_TIMES = 4  # executions of a task that are chosen because one execution does not explain it
 _FAR = 10.0  # multiple of what is known or allowed from which a predicted distance is said to be dangerous
 
 
@@ -136,9 +140,33 @@ class IntervalSearch:
         """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""
         trials = self.recorder.trials
         # A hypercube that was begun is completed, because what a part of it shows must not decide that it is left.
-        if self.tests < MANY or self._suite is not None or spread_tests(trials) % TESTS:
-            return Choice.tested(self.recorder.draws.test(trials), "spread")
-        return Choice.tested(self.recorder.draw(), "iid")
+        number, row = divmod(spread_tests(trials), TESTS)
+        if self.tests >= MANY and self._suite is None and not row:
+            return Choice.tested(self.recorder.draw(), "iid")
+        if self._suite is not None:
+            return Choice.tested(self.recorder.draws.hypercube(number)[row], "spread")
+        if row:
+            begun = (hypercube_in(trial.note) for trial in reversed(trials))
+            (chosen, _), note = next(filter(None, begun), (0, 1.0)), None
+        else:
+            chosen, share = self._hypercube(number)
+            note = {HYPERCUBE: [chosen, share]}
+        return replace(Choice.tested(self.recorder.draws.hypercube(number, chosen)[row], "spread"), note=note)
+
+    def _hypercube(self, number: int) -> tuple[int, float]:
+        """Return which of many hypercubes the next tests are from, and the share of those that are like it.
+
+        It is the first one with half of its tests where large distances are predicted, or with the most such tests:
+        small distances hardly test the dynamics.
+        """
+        learned, needed = self.recorder.dynamics.learned(self.recorder.trials), min(self.tests, TESTS)
+        if learned is None:
+            return 0, 1.0
+        tasks = np.stack([self.recorder.draws.hypercube(number, k)[:needed] for k in range(_HYPERCUBES)])
+        is_large = learned.near_pool(tasks.reshape(-1, tasks.shape[2])) >= LEVERAGE * learned.worst_of_mean.highest
+        large = is_large.reshape(tasks.shape[:2]).sum(axis=1)
+        alike = large >= min((needed + 1) // 2, large.max())
+        return int(alike.argmax()), float(alike.mean())
 
     # The choices, in the order in which they are tried
 
@@ -177,8 +205,9 @@ class IntervalSearch:
             return None
         trials = self.recorder.trials
         tests = (test for test in reversed(evidence.predictions) if test.stored and test.origin in DRAWN)
-        wrong = (test for test in tests if not held(test, self.best))
-        failed = next((t for t in wrong if t.is_noisy or t.explained is None or not is_explained(t, bound)), None)
+        wrong = (test for test in tests if not holds(evidence, test, self.best))
+        unexplained = (t for t in wrong if t.is_noisy or t.explained is None or not is_explained(evidence, t, bound))
+        failed = next(unexplained, None)
         if failed is None or trials.worst is None:
             return None
         worst = trials.worst.unit_point
@@ -230,8 +259,11 @@ class IntervalSearch:
                 return self._by_distance()
             evidence = whole.needing(self.tests)
             with suppress(CertificateError):
-                if certify_dynamics(Sample.of(trials.ended), evidence, confidence).covers(self.limit):
+                sample = replace(Sample.of(trials.ended), threshold=self.limit)
+                if certify_dynamics(sample, evidence, confidence).covers(self.limit):
                     return None
+            if (task := self._again(evidence)) is not None:
+                return Choice.tested(task)
         # For `auto`, the posterior bound of the distance is tried after many executions, besides tests, that decided
         # nothing, and earlier if they cover the tasks, as they soon do in few dimensions.
         lacks_tests = self._lacks_tests_alone(evidence)
@@ -243,6 +275,19 @@ class IntervalSearch:
             if covering(self._points(trials), kind.resolution, 0) is not None and self._by_distance() is None:
                 return None
         return self.test() if lacks_tests else self._by_evidence(evidence)
+
+    def _again(self, evidence: DynamicsEvidence) -> Array | None:
+        """Return a task whose further execution tells what one execution of a noisy system does not; else None."""
+        if self._suite is not None or evidence.quantile is None:
+            return None
+        if evidence.influential is not None:
+            return np.array(evidence.influential)
+        least = least_explained(evidence.executed)
+        if least is None or evidence_against(evidence.executed) <= CONTRADICTED:
+            return None
+        task = np.array(least.point)
+        times = sum(np.abs(trial.unit_point - task).max() <= SAME for trial in self.recorder.trials)
+        return task if times < _TIMES else None
 
     def _by_evidence(self, evidence: DynamicsEvidence) -> Choice:
         """Return the task that the learned dynamics choose."""

@@ -213,11 +213,10 @@ class IndependentDraws:
         space = self._validation.space
         return space.rounded(space.unit_draws(1, self._generator(len(trials), _DRAW))[0])
 
-    def test(self, trials: Sequence[Trial]) -> Array:
-        """Return the next point ``(d,)`` of the Latin hypercubes of tests, whatever the results are."""
-        block, row = divmod(spread_tests(trials), TESTS)
-        points = latin_hypercube(TESTS, self._validation.space.dimension, self._generator(block, _HYPERCUBE))
-        return np.asarray(points[row])
+    def hypercube(self, number: int, candidate: int = 0) -> Array:
+        """Return one of the Latin hypercubes for tests of a number ``(TESTS, d)``, whatever the results are."""
+        rng = self._generator(number, _HYPERCUBE, *([candidate] if candidate else []))
+        return latin_hypercube(TESTS, self._validation.space.dimension, rng)
 
     def left(self, trials: Sequence[Trial]) -> Array:
         """Return the first task of a suite that is left in an order that was drawn once, ``(d,)``."""
@@ -228,9 +227,9 @@ class IndependentDraws:
         order = self._generator(0, _DRAW).permutation(len(members))
         return next(task for task in members[order] if task.tobytes() in known)
 
-    def _generator(self, number: int, stream: int) -> np.random.Generator:
+    def _generator(self, number: int, stream: int, *further: int) -> np.random.Generator:
         """Return the random numbers of a draw; the streams of searches have smaller numbers."""
-        return np.random.default_rng(np.random.SeedSequence([self._seed, number, stream, self.of_model()]))
+        return np.random.default_rng(np.random.SeedSequence([self._seed, number, stream, self.of_model(), *further]))
 
     def of_model(self) -> int:
         """Return the number of the model, which the store keeps, because another processor rounds differently."""

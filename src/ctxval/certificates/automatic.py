@@ -104,7 +104,8 @@ class Automatic(CertificateKind):
             return by_dynamics
         # Tests at drawn tasks may be missing for it, too.
         origins = [origin for origin in sample.origins if self.tests and origin in DRAWN]
-        shown = shown_by_tests(origins, sample.points.shape[1], certificate.confidence, uniform=sample.is_uniform)
+        dimension, uniform = sample.points.shape[1], sample.is_uniform
+        shown = shown_by_tests(origins, dimension, confidence, uniform=uniform, selected=sample.selected)
         doubt, missing = certificate.doubt, self.missing_tests(sample)
         if doubt is None and missing:
             doubt = (

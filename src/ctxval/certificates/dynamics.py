@@ -26,6 +26,7 @@ from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.bounds import rank_within
 from ctxval.certificates.covering import largest_empty_box
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
+from ctxval.certificates.explained import share_supported
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.prediction_tests import TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed, require_learned
@@ -128,6 +129,10 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
     statement = statements.dynamics_statement(upper, error, confidence, evidence.quantile)
     assumptions = statements.dynamics_assumptions(evidence)
     doubt = doubt or diagnostics.doubt_of(evidence, sample.best, bound)
+    level = upper if sample.threshold is None else sample.threshold
+    doubt = doubt or diagnostics.unsupported(evidence, level, bound)
+    above = sum(each.distance > level for each in evidence.executed)
+    is_noisy = evidence.quantile is not None
     copied = {name: getattr(evidence, name) for name in _COPIED}
     details = {
         "best": sample.best,
@@ -148,16 +153,21 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "held": sum(diagnostics.held(prediction, bound) for prediction in last),
         },
         "tests": {
-            **shown_by_tests(drawn, sample.points.shape[1], confidence, uniform=sample.is_uniform),
+            **shown_by_tests(
+                drawn, sample.points.shape[1], confidence, uniform=sample.is_uniform, selected=sample.selected
+            ),
             "largest_error": max((test.error for test in tests), default=None),
         },
-        "checked": [{**each.to_json(), "held": bool(diagnostics.held(each, bound))} for each in evidence.predictions],
+        "checked": [
+            {**each.to_json(), "held": bool(diagnostics.holds(evidence, each, bound))} for each in evidence.predictions
+        ],
         "coverage_gap": coverage.marginal.size,
         "beyond_the_records": coverage.beyond.size,
         "coverage_gap_of_pairs": None if coverage.pair is None else coverage.pair.size,
         "largest_gap_at": coverage.marginal.place,
         "resolution": coverage.resolution,
         **{name: list(value) if isinstance(value, tuple) else value for name, value in copied.items()},
+        "share_supported": share_supported(evidence.executions, above, confidence) if is_noisy else None,
         "variance_left_out": evidence.left_out,
         "pocket": evidence.pocket and asdict(evidence.pocket),
         "empty_box": None if empty is None else asdict(empty),

@@ -13,6 +13,7 @@ import numpy as np
 
 from ctxval.certificates.bounds import radius_of, with_units
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
+from ctxval.certificates.explained import CONTRADICTED, evidence_against, least_explained, support_of
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.sentences import withdrawals as sentences
 from ctxval.core.coverage import StateInputGap
@@ -50,6 +51,13 @@ VAGUE = 2.0
 UNLIKELY = 0.01  # least predicted probability of a distance as large as the executed one
 EVIDENCE = 20.0  # e-value of the last predictions of a noisy system at which they are rejected
 EVIDENCE_OF = 6  # number of these predictions
+SMALL = 0.1  # least predicted distance, as a share of the bound, by which the error of a drawn test is judged
+USUAL = 4.0  # multiple of the median error of drawn tests up to which an error is usual
+SUPPORTED = 1.0  # least likelihood ratio of the law against a share of executions above the threshold
+DRIFTING = 0.005  # p-value below which the effects of executions change with their order, or with a task parameter
+UNEVEN = (
+    1.5  # ratio of a force that a joint withstood to one that moved it from which friction at rest differs by place
+)
 AGREE = 0.05  # share by which two deeper searches may differ, and by which they may exceed the usual one
 
 
@@ -107,14 +115,34 @@ def missing_tests(predictions: Sequence[CheckedPrediction], tests: int) -> int:
     return max(tests - sum(not (each.is_noisy and each.upper > VAGUE * largest) for each in drawn), 0)
 
 
-def is_explained(prediction: CheckedPrediction, bound: float) -> bool:
+def own_error(evidence: DynamicsEvidence, prediction: CheckedPrediction, bound: float) -> float:
+    """Return the largest error with which the prediction of a test at a drawn task holds.
+
+    Most drawn tasks have small distances, where a share of the bound is a large error. So it is a share of the test's
+    own distance or, if that is more, a multiple of the usual error.
+    """
+    errors = [each.error for each in evidence.predictions if each.stored and each.origin in DRAWN and not each.is_noisy]
+    own = ACCURATE * max(prediction.median, SMALL * bound)
+    return min(ACCURATE * bound, max(own, USUAL * float(np.median(errors)))) if errors else ACCURATE * bound
+
+
+def holds(evidence: DynamicsEvidence, prediction: CheckedPrediction, bound: float) -> bool:
+    """Return whether a prediction held; if it is one of a drawn test, also by its own distance."""
+    if prediction.is_noisy or not (prediction.stored and prediction.origin in DRAWN):
+        return held(prediction, bound)
+    return prediction.error <= own_error(evidence, prediction, bound)
+
+
+def is_explained(evidence: DynamicsEvidence, prediction: CheckedPrediction, bound: float) -> bool:
     """Return whether what is learned by now has the distance that was executed; unknown ones count as explained.
 
     If the dynamics depend on the task, one function of state and input cannot have the distances of all tasks. Noise
     explains none of its executions, and may be any of them.
     """
     known = prediction.explained
-    return prediction.is_noisy or known is None or agrees(prediction.distance, known, bound)
+    if prediction.is_noisy or known is None:
+        return True
+    return abs(prediction.distance - known) <= own_error(evidence, prediction, bound)
 
 
 def failed(evidence: DynamicsEvidence, bound: float) -> CheckedPrediction | None:
@@ -123,9 +151,9 @@ def failed(evidence: DynamicsEvidence, bound: float) -> CheckedPrediction | None
     Later tests outlive a test that failed only if it is explained by now.
     """
     drawn = [test for test in evidence.predictions if test.stored and test.origin in DRAWN]
-    lasting = [test for test in drawn if evidence.tests and not is_explained(test, bound)]
+    lasting = [test for test in drawn if evidence.tests and not is_explained(evidence, test, bound)]
     last = [*tested(evidence.predictions, evidence.tests), *lasting, *counted(evidence, bound)[-PREDICTIONS:]]
-    wrong = (prediction for prediction in last if not held(prediction, bound))
+    wrong = (prediction for prediction in last if not holds(evidence, prediction, bound))
     return max(wrong, key=lambda prediction: prediction.error, default=None)
 
 
@@ -170,7 +198,7 @@ def only_tests_missing(evidence: DynamicsEvidence, best: float, bound: float) ->
 def only_a_failed_test(evidence: DynamicsEvidence, best: float, bound: float, limit: float) -> bool:
     """Return whether an earlier test that failed is all that raises the bound above a limit: later tests outlive it."""
     worst = failed(evidence, bound)
-    if worst is None or worst.origin not in DRAWN or not is_explained(worst, bound):
+    if worst is None or worst.origin not in DRAWN or not is_explained(evidence, worst, bound):
         return False
     recent = all(held(prediction, bound) for prediction in counted(evidence, bound)[-PREDICTIONS:])
     outlived = recent and raised(evidence, bound) > limit
@@ -192,6 +220,7 @@ def doubts(evidence: DynamicsEvidence, best: float, bound: float) -> Iterator[st
     yield from untested(evidence, best, bound, raised(evidence, bound))
     if (missing := tests_missing(evidence)) is not None:
         yield missing
+    yield from unexplained(evidence, bound)
     if not evidence.dense and jumps(evidence, bound):
         what = sentences.JUMP.format(percent=100 * evidence.jump / bound)
         if evidence.sharpness > SHARP:
@@ -225,6 +254,35 @@ def unlearned(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
         yield sentences.NOISE_CONTRADICTED.format(against=against, most=EVIDENCE)
     if evidence.left_out > LEFT_OUT:
         yield sentences.LEFT_OUT.format(percent=100 * evidence.left_out, most=100 * LEFT_OUT)
+
+
+def unexplained(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
+    """Yield which executions the law that all of them teach does not explain, and which differ as they should not."""
+    silent = [each for each in evidence.executed if not each.quantiles]
+    farthest = max(silent, key=lambda each: abs(each.distance - each.expected), default=None)
+    if farthest is not None and not agrees(farthest.distance, farthest.expected, bound):
+        yield sentences.UNEXPLAINED.format(**vars(farthest))
+    against = evidence_against(evidence.executed)
+    if against > CONTRADICTED and (least := least_explained(evidence.executed)) is not None:
+        yield sentences.CONTRADICTED.format(against=against, most=CONTRADICTED, trial=least.trial, p=least.p_value)
+    if evidence.influential is not None:
+        yield sentences.EXECUTED_ONCE
+    if evidence.drift is not None and evidence.drift[1] < DRIFTING:
+        yield sentences.DRIFT.format(cause=evidence.drift[0], p=evidence.drift[1])
+    if evidence.uneven > UNEVEN:
+        yield sentences.UNEVEN.format(times=evidence.uneven)
+
+
+def unsupported(evidence: DynamicsEvidence, threshold: float, bound: float) -> str | None:
+    """Return that executions of a noisy system speak against a threshold more than for it; None if they do not."""
+    if evidence.quantile is None:
+        return None
+    ratio = support_of(evidence.executed, threshold, bound, evidence.quantile)
+    if ratio >= SUPPORTED:
+        return None
+    above, share = sum(each.distance > threshold for each in evidence.executed), 100 * (1 - evidence.quantile)
+    executions = len(evidence.executed)
+    return sentences.UNSUPPORTED.format(above=above, executions=executions, level=threshold, ratio=ratio, share=share)
 
 
 def uncovered(evidence: DynamicsEvidence) -> list[str]:

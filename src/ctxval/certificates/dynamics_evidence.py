@@ -12,6 +12,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import rank_of
+from ctxval.certificates.explained import ExplainedExecution
 from ctxval.certificates.prediction_tests import MANY, TESTS
 from ctxval.core.coverage import StateInputCoverage, StateInputGap, StatePocket, UntriedCorner, UntriedParameter
 from ctxval.core.learned_numbers import PushedDistances
@@ -105,6 +106,12 @@ class DynamicsEvidence(ShortRepr):
     suspect: tuple[str, float] | None = None
     without_data: bool = False  #: whether the data that M was made from are left out, as they contradict the executions
     estimated: bool = False  #: whether states of M are estimated from recorded outputs
+    executed: tuple[ExplainedExecution, ...] = ()  #: all executions beside what they teach; empty in a screening
+    #: the execution of which the learned noisy dynamics depend most, if its task was executed once; else None
+    influential: tuple[float, ...] | None = None
+    drift: tuple[str, float] | None = None  #: with what effects of executions change, and its p-value; None without any
+    #: of friction at rest, by how many times a force that a joint withstood exceeds one that moved it elsewhere
+    uneven: float = 1.0
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""
@@ -158,6 +165,13 @@ class DynamicsEvidence(ShortRepr):
                 "pushed": values["pushed"] and PushedDistances.from_json(values["pushed"]),
                 "pocket": pocket and StatePocket(**{**pocket, "tasks": tuple(map(tuple, pocket["tasks"]))}),
                 "physical": tuple(values["physical"]),
+                "executed": tuple(
+                    ExplainedExecution(
+                        **{**each, **{name: tuple(each[name]) for name in ("point", "quantiles", "p_values")}}
+                    )
+                    for each in values["executed"]
+                ),
+                **{name: values[name] and tuple(values[name]) for name in ("influential", "drift")},
             }
             return cls(**{**values, **parts})
         except (AttributeError, KeyError, TypeError, ValueError):

@@ -9,13 +9,18 @@ system is, if none of them exceeds it: a set of a share v of the tasks is missed
 .. math:: G^{(d-1)}(1 - v)^m, \qquad G(x) = \varphi(n x) / \varphi(n), \qquad \varphi(r) = (r!)^{1/r},
 
 with linear interpolation of :math:`\varphi` between integers and :math:`\varphi(0) = 0`; docs/theory.md has the proof.
-From ``MANY`` tests on, tests are independent draws: these meet one part of ``TESTS`` with a probability of 95 %.
+A hypercube is chosen among many because it tests where large distances are predicted. If a share s of all hypercubes
+is like it, such sets are missed with at most 1 / s times this probability. The same holds for executions of a noisy
+system, each of which exceeds the threshold with a probability of its own: G is concave, so independent noise makes no
+set easier to miss. From ``MANY`` tests on, tests are independent draws: these meet one part of ``TESTS`` with a
+probability of 95 %.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +28,17 @@ from ctxval.core.trial import Origin
 
 TESTS = 8  # default number, and number of points of a hypercube
 MANY = 22  # number of tests from which on they are independent draws
+HYPERCUBE = "hypercube"
+"""Key of the number of a hypercube, and of the share of hypercubes that are like it, in the note of its first test."""
 DRAWN: tuple[Origin, ...] = ("iid", "spread")  # origins of tests: independent draws, and points of hypercubes
+
+
+def hypercube_in(note: Mapping[str, Any] | None) -> tuple[int, float] | None:
+    """Return the number of the hypercube that begins with a trial, and the share of those like it; else None."""
+    match (note or {}).get(HYPERCUBE):
+        case [int(number), float(share)] if number >= 0 and 0 < share <= 1:
+            return number, share
+    return None
 
 
 def share_missed(spread: int, independent: int, dimension: int, confidence: float) -> float:
@@ -48,13 +63,15 @@ def probability_missed(kept: float, dimension: int, points: int = TESTS) -> floa
 
 
 def shown_by_tests(
-    origins: Sequence[Origin], dimension: int, confidence: float, *, uniform: bool
+    origins: Sequence[Origin], dimension: int, confidence: float, *, uniform: bool, selected: float = 1.0
 ) -> dict[str, int | float | None]:
     """Return the number of tests with these origins, and which share of the tasks exceeds what no test exceeds.
 
-    Points of hypercubes show nothing of tasks with a distribution, because they are uniform.
+    Points of hypercubes show nothing of tasks with a distribution, because they are uniform. They were ``selected``
+    from a larger number of hypercubes, of which they are this share.
     """
     independent = origins.count("iid")
     spread = origins.count("spread") if uniform else 0
-    share = share_missed(spread, independent, dimension, confidence) if spread or independent else None
+    needed = 1 - (1 - confidence) * (selected if spread else 1.0)
+    share = share_missed(spread, independent, dimension, needed) if spread or independent else None
     return {"drawn": len(origins), "independent": independent, "spread": spread, "share_missed": share}

@@ -12,6 +12,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
 from ctxval.certificates.dynamics_evidence import LearnedDistance
+from ctxval.certificates.prediction_tests import hypercube_in
 from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
 from ctxval.errors import CertificateError
 
@@ -48,6 +49,7 @@ class Sample(ShortRepr):
     distribution: str | None = None  #: the distribution of tasks as a text; None if it is uniform
     suite: Array | None = None  #: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box
     threshold: float | None = None  #: the threshold that is to be decided; None if there is none
+    selected: float = 1.0  #: the share of all hypercubes that those of the tests were chosen from
 
     def __post_init__(self) -> None:
         if not len(self.numbers):
@@ -104,6 +106,7 @@ class Sample(ShortRepr):
             [each if isinstance(each, int) else None for each in planned],
             tuple(made_good),
             learned,
+            selected=float(np.prod([chosen[1] for trial in trials if (chosen := hypercube_in(trial.note))])),
         )
 
     def only(self, origin: Origin) -> Sample:

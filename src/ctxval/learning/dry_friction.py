@@ -106,12 +106,13 @@ class DryFriction:
         largest = self.sliding + self.load * np.abs(u)
         return largest + self.excess * _slowness(before, after, self.slow) if self.excess.any() else largest
 
-    def resting(self, transitions: Transitions, missed: Callable[[Array], Array]) -> tuple[Array, Array, Array]:
+    def resting(self, transitions: Transitions, missed: Callable[[Array], Array]) -> tuple[Array, Array, Array, Array]:
         """Return the least and the largest friction at rest, and that of turning joints, that transitions permit.
 
-        Those at rest, against pushes below and above 0, have the shape ``(2, m)``, the last one ``(m,)``. M misses
+        Those at rest, against pushes below and above 0, have the shape ``(2, m)``, the third one ``(m,)``. M misses
         ``missed(acting inputs)``. Friction that depends on the place or on the time at rest holds at one force and not
-        at a smaller one: then only larger forces that set a joint in motion count.
+        at a smaller one: then only larger forces that set a joint in motion count for the largest one. The last array
+        is the ratio ``(2, m)`` of the two forces; it is 1 if friction may be the same everywhere.
         """
         x, u, m = transitions.x, transitions.u, len(self.rates)
         before, after = x[:, self.rates], transitions.x_next[:, self.rates]
@@ -128,7 +129,7 @@ class DryFriction:
         errors = np.abs(force - self._limits(u, before, after) * moves)[(moves != 0).all(axis=1)]
         usual = _ERRORS * np.median(errors, axis=0)
         least, largest = np.stack([self.sliding] * 2), np.stack([np.abs(u).max(axis=0)] * 2)
-        passed = np.full(m, np.inf)
+        passed, uneven = np.full(m, np.inf), np.ones((2, m))
         for j in range(m):
             holding = force.copy()  # what would have kept this joint at its rate
             holding[:, j] += (after - before)[:, j] / of_rates[:, j, j]
@@ -142,11 +143,14 @@ class DryFriction:
             for i, pushed in enumerate((holding[:, j] <= 0, holding[:, j] > 0)):
                 most = float(withstood[pushed & held].max(initial=0.0))
                 least[i, j] = max(self.sliding[j], most - usual[j])
-                started = pushed & (first <= slow) & (last > np.maximum(2 * little, slow)) & (withstood > most)
-                largest[i, j] = max(least[i, j], withstood[started].min(initial=largest[i, j]) + usual[j])
+                started = pushed & (first <= slow) & (last > np.maximum(2 * little, slow))
+                moved = withstood[started & (withstood > most)].min(initial=largest[i, j])
+                largest[i, j] = max(least[i, j], moved + usual[j])
+                smallest = withstood[started].min(initial=most) + 2 * usual[j]
+                uneven[i, j] = max(1.0, most / smallest if smallest > 0 else 1.0)
             turned = ((before * after)[:, j] < 0) & (np.minimum(first, last) > slow)
             passed[j] = withstood[turned].min(initial=np.inf) + usual[j]
-        return least, largest, passed
+        return least, largest, passed, uneven
 
     def acting(self, transitions: Transitions) -> tuple[Transitions, Mask]:
         """Return transitions with the inputs that act, and of which the friction is known ``(N,)``: all joints move."""

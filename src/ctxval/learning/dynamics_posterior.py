@@ -198,8 +198,8 @@ class DynamicsPosterior(ShortRepr):
         return DynamicsDraws(self.model_with(least), self.data, (mean,), limit=self.limit[self.data.learned])
 
     @functools.cached_property
-    def resting(self) -> tuple[Array, Array, Array] | None:
-        """The least and the largest dry friction at rest ``(2, m)``, and as joints turn ``(m,)``; None without any."""
+    def resting(self) -> tuple[Array, Array, Array, Array] | None:
+        """The numbers of :meth:`DryFriction.resting`; None without dry friction."""
         model, steps = self.covariances.model, self.data.executions
         if not isinstance(model, DryFriction):
             return None
@@ -212,7 +212,7 @@ class DynamicsPosterior(ShortRepr):
         model = self.with_most_friction
         if not isinstance(model, DryFriction) or self.resting is None:
             return model
-        least, largest, _ = self.resting
+        least, largest, *_ = self.resting
         return replace(model, rest=(least + shares[:, None, None] * (largest - least))[:, None])
 
     def unfamiliarity(self, states: Array, inputs: Array) -> Array:

@@ -15,7 +15,7 @@ from itertools import groupby
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Rows
 from ctxval.core.model import Model
 
 Residual = Callable[[Array], Array]  # r(z) of regressors (..., D), shape (..., n)
@@ -132,6 +132,18 @@ def of_one_horizon(records: Sequence[Record]) -> Iterator[list[Record]]:
     ordered = sorted(records, key=lambda record: len(record.inputs))
     for _, alike in groupby(ordered, key=lambda record: len(record.inputs)):
         yield list(alike)
+
+
+def rows_of_executions(records: Sequence[Record]) -> list[Rows]:
+    """Return the rows of each record in what :meth:`History.along` returns, in the order of time."""
+    order = sorted(range(len(records)), key=lambda k: len(records[k].inputs))
+    rows, first = [np.empty(0, dtype=np.intp)] * len(records), 0
+    for alike in of_one_horizon(records):
+        steps, many = len(alike[0].inputs), len(alike)
+        for j in range(many):
+            rows[order.pop(0)] = first + j + many * np.arange(steps)
+        first += many * steps
+    return rows
 
 
 def jacobian(function: Callable[[Array], Array], x: Array, steps: Array) -> Array:

@@ -18,10 +18,11 @@ from itertools import product
 import numpy as np
 from scipy.special import logsumexp
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.learning.features import Features, spread_rows
-from ctxval.learning.histories import History, Memory, Record, jacobian, of_one_horizon
+from ctxval.learning.histories import History, Memory, Record, jacobian, of_one_horizon, rows_of_executions
 from ctxval.learning.local_noise import LocalNoise, local_noise
+from ctxval.learning.run_effects import RunEffects, run_effects
 
 CENTRES = 64
 _CANDIDATES = 600  # regressors from which centres are chosen
@@ -91,6 +92,23 @@ class InnovationsFit(ABC):
     evidence: float  # logarithm of the evidence, to compare structures
     innovations: Array  # recorded innovations with a root mean square of 1, (N, n)
     local: LocalNoise | None  # how the noise changes with state and input; None if it does not
+    executions: Sequence[Rows]  # the rows of each execution in the order of time, in the order of the executions
+
+    @functools.cached_property
+    def runs(self) -> RunEffects:
+        """What the innovations of each execution have in common."""
+        pairs = self.scaled.Z[:, : self.scaled.states + self.scaled.inputs]
+        return run_effects(pairs, self.innovations, self.live, self.executions, self._hats())
+
+    def influences(self, tasks: Sequence[Sequence[int]]) -> Array | None:
+        """Return how far the residual along the executions of each task depends on them, in deviations of the noise.
+
+        It is the change of the residual if they are left out (Cook 1977), shape ``(T,)``; None in a filter.
+        """
+        return None
+
+    def _hats(self) -> list[tuple[Array, Array]] | None:
+        return None
 
     @property
     def share(self) -> float:
@@ -115,6 +133,23 @@ class LaggedFit(InnovationsFit):
     """The posterior if records are the state, known in closed form; regressors may have lags."""
 
     rows: Array  # weights of the transitions, (N, 1)
+
+    def _hats(self) -> list[tuple[Array, Array]]:
+        phi = self.features(self.scaled.Z)
+        spectrum = _Spectrum.of(phi, self.scaled, self.live, self.rows)
+        Phi = phi * self.rows
+        return [(Phi, spectrum.vectors / (spectrum.values + ridge) @ spectrum.vectors.T) for ridge in spectrum.ridges]
+
+    def influences(self, tasks: Sequence[Sequence[int]]) -> Array:
+        """Return how far the residual along the executions of each task depends on them; see the base class."""
+        squares = np.zeros((len(tasks), int(self.live.sum())))
+        for place, (i, (Phi, inverse)) in enumerate(zip(np.flatnonzero(self.live), self._hats(), strict=True)):
+            for row, executions in enumerate(tasks):
+                steps = np.concatenate([self.executions[k] for k in executions])
+                own, e = Phi[steps], self.innovations[steps, i]
+                without = np.eye(len(inverse)) - own.T @ own @ inverse
+                squares[row, place] = ((own @ inverse @ np.linalg.solve(without, own.T @ e)) ** 2).mean()
+        return np.asarray(np.sqrt(squares.max(axis=1, initial=0.0)))
 
     def draw(self, groups: int, each: int, rng: np.random.Generator) -> list[DrawnWeights]:
         """Return draws in groups of the same hyperparameters."""
@@ -184,6 +219,12 @@ class _Spectrum:
             grids.append((self.log_evidence(i, amplitudes, noises), amplitudes, noises))
         return grids
 
+    @property
+    def ridges(self) -> list[float]:
+        """The variance of the noise over that of the weights at the mode, for each state."""
+        modes = [(np.unravel_index(int(heights.argmax()), heights.shape), a, s) for heights, a, s in self._grids]
+        return [float(noises[k] / amplitudes[j]) ** 2 for (j, k), amplitudes, noises in modes]
+
     def draw(self, rng: np.random.Generator | None) -> tuple[Array, Array]:
         """Return weights ``(F, live)`` and noises ``(live,)`` in the units of states; the mode if there is no rng."""
         weights, noises = [], []
@@ -224,8 +265,9 @@ def fit_lagged(
     Z, E, _ = history.along(records)
     scaled, rows = Scaled.of(Z, E, pairs, records[0].inputs.shape[1], products), np.ones((len(Z), 1))
     most_likely = np.full(scaled.states + scaled.inputs + 2, _LENGTH)  # a priori
+    runs = rows_of_executions(records)
     if usual:
-        return _conditioned(history, scaled, most_likely, live, rows, None)
+        return _conditioned(history, scaled, most_likely, live, rows, None, runs)
     if theta is None:
         theta, best = most_likely, _height(scaled, most_likely, live, rows)
         # Moves of one coordinate at a time; that of lags does nothing if there are none.
@@ -238,12 +280,12 @@ def fit_lagged(
                 if height > best:
                     theta, best = other, height
                     break
-    fit, within = _conditioned(history, scaled, theta, live, rows, None), scaled.Z[:, : pairs.shape[1]]
+    fit, within = _conditioned(history, scaled, theta, live, rows, None, runs), scaled.Z[:, : pairs.shape[1]]
     for _ in range(3):  # records with little noise weigh more, so the mean fits them better, and noise differs more
         local = local_noise(within, _unit(fit.innovations / fit.rows, live)[:, live])
         if local is None:
             return fit
-        fit = _conditioned(history, scaled, theta, live, 1 / local(within)[:, None], local)
+        fit = _conditioned(history, scaled, theta, live, 1 / local(within)[:, None], local, runs)
     # Where there is no noise at all, innovations are smaller than weights say. Drawn among these, those beyond an edge
     # would be too small.
     left = local_noise(within, fit.innovations[:, live])
@@ -254,7 +296,13 @@ def fit_lagged(
 
 
 def _conditioned(
-    history: History, scaled: Scaled, theta: Array, live: Mask, rows: Array, local: LocalNoise | None
+    history: History,
+    scaled: Scaled,
+    theta: Array,
+    live: Mask,
+    rows: Array,
+    local: LocalNoise | None,
+    runs: Sequence[Rows],
 ) -> LaggedFit:
     features = scaled.features(theta)
     phi = features(scaled.Z)
@@ -264,7 +312,7 @@ def _conditioned(
     innovations = _unit((scaled.E - phi @ weights) * rows, live)
     units = len(scaled.Z) * np.log(scaled.sizes[live]).sum() - live.sum() * np.log(rows).sum()
     evidence = spectrum.log_posterior(theta) - units
-    return LaggedFit(history, scaled, theta, live, features, weights, noise, evidence, innovations, local, rows)
+    return LaggedFit(history, scaled, theta, live, features, weights, noise, evidence, innovations, local, runs, rows)
 
 
 def _unit(innovations: Array, live: Mask) -> Array:
@@ -329,6 +377,7 @@ def fit_filter(
     weights, noise = weights * live, noise * live
     fit = FilterFit(
         history, scaled, theta, live, features, weights, noise, 0.0, np.zeros((N, n)), None,
+        rows_of_executions(records),
         np.asarray(np.linalg.cholesky(0.5 * (covariance + covariance.T) + 1e-18 * np.eye(len(A)))),
     )  # fmt: skip
     innovations = history.along(records, fit.residual)[2]

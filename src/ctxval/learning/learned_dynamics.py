@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import ShortRepr
@@ -83,6 +84,11 @@ class LearnedDynamics(ShortRepr):
         planner = self.study.planner
         with single_threaded():
             return np.asarray(planner.distances(self.drawn_from.mean, planner.plan(points), len(points))[0])
+
+    def near_pool(self, points: Array) -> Array:
+        """Return the distances on the posterior mean ``(m,)`` of the tasks of the pool next to points ``(m, d)``."""
+        nearest = cdist(points, self.study.search.pool).argmin(axis=1)
+        return np.asarray(self._on_pool[0][nearest])
 
     def trajectories(self, points: Array) -> list[tuple[Array, Trajectory]]:
         """Return tasks ``(m, d)`` with their closed loops on the posterior mean, without those that diverge."""
@@ -312,15 +318,52 @@ class LearnedDynamics(ShortRepr):
 
     def predict(self, point: Array) -> ExecutionPrediction | None:
         """Return the prediction of the execution of a task, a point ``(d,)``; None if it cannot be planned."""
+        return self.predictions(point[None])[0]
+
+    def predictions(self, points: Array) -> list[ExecutionPrediction | None]:
+        """Return the predictions of the executions of tasks ``(m, d)`` by the same draws; None for one without plan."""
         rng, planner = self._rng(2), self.study.planner
         with single_threaded():
-            pairs = loop_pairs(planner, self.drawn_from, point[None])
+            pairs = loop_pairs(planner, self.drawn_from, points)
             if self.noisy is None and not len(pairs):
-                return None
+                return [None] * len(points)
             draws = self.drawn_from.draw(pairs[rng.permutation(len(pairs))[:300]], rng)
             if isinstance(draws, DynamicsDraws):  # if friction at rest made predictions vague, they could not fail
                 draws = replace(draws, model=self.posterior.model_with(np.zeros(len(draws))))
-            return predict_execution(planner, draws, point, len(self.executed), self.study.extended.recorded)
+            recorded = self.study.extended.recorded
+            return [predict_execution(planner, draws, point, len(self.executed), recorded) for point in points]
+
+    @property
+    def influential(self) -> Array | None:
+        """The task on whose execution the noisy dynamics depend most, ``(d,)``; None if such a task was executed twice.
+
+        One execution does not tell what is a property of its task or place from what is one of this execution.
+        """
+        if self.noisy is None or not self.noisy.is_noisy:
+            return None
+        tasks, of_task = np.unique(self.executed, axis=0, return_inverse=True)
+        executions = [np.flatnonzero(of_task.ravel() == row).tolist() for row in range(len(tasks))]
+        influences = self.noisy.fit.influences(executions)
+        if influences is None:  # the largest distance instead
+            influences = np.nan_to_num(self.expected(tasks), posinf=0.0)
+        # Of tasks with about the same influence, one executed twice suffices.
+        twice = max((value for value, rows in zip(influences, executions, strict=True) if len(rows) > 1), default=0.0)
+        return None if twice > 0.5 * influences.max() else tasks[int(influences.argmax())]
+
+    @property
+    def drift(self) -> tuple[str, float] | None:
+        """What the effects of whole executions change with, and the p-value; None if there are none."""
+        if self.noisy is None or not self.noisy.is_noisy:
+            return None
+        columns = np.column_stack([np.arange(len(self.executed)), self.executed])
+        found = self.noisy.fit.runs.drift(columns)
+        return found and (["the order of the executions", *self.study.validation.space.names][found[0]], found[1])
+
+    @property
+    def uneven_friction(self) -> float:
+        """By how many times a force that a joint withstood exceeds one that moved it; 1 if none does."""
+        resting = self.posterior.resting
+        return 1.0 if resting is None else float(resting[3].max())
 
     def _rng(self, purpose: int) -> np.random.Generator:
         return np.random.default_rng([self.study.seed, len(self.executed), purpose])

@@ -1,6 +1,8 @@
 """Noisy dynamics: their posterior, and draws of it.
 
-A draw has a residual and sequences of noise, and its distance is a quantile over these.
+A draw has a residual and sequences of noise, and its distance is a quantile over these. If executions differ by more
+than independent steps do, every second sequence is that of a whole execution with its effects, and the larger one of
+the quantiles over both kinds of sequences counts.
 """
 
 from __future__ import annotations
@@ -36,6 +38,7 @@ class NoisyDraws(Draws):
     rows: Rows  # recorded innovations that are the noise of each step, (S, R, T); longer loops repeat them
     start: Array  # differences of the first records from the initial states of the tasks, (S, R, n)
     quantile: float  # q; the distance of a draw is this quantile over its sequences of noise
+    of_runs: Rows | None = None  # the execution whose innovations each sequence has, or -1, (S, R); None without any
     left_out: float = 0.0
 
     @classmethod
@@ -44,9 +47,17 @@ class NoisyDraws(Draws):
         quantile: float, rng: np.random.Generator,
     ) -> Self:  # fmt: skip
         """Return draws with fresh noise; the first records scatter with standard deviations ``(n,)``."""
-        shape = (sum(len(weights) for _, weights, _ in groups), replicates)
+        whole = replicates > 1 and fit.runs.matter
+        shape = (sum(len(weights) for _, weights, _ in groups), replicates * (2 if whole else 1))
         rows = rng.integers(len(fit.innovations), size=(*shape, horizon))
-        return cls(fit, tuple(groups), rows, scatter * rng.standard_normal((*shape, len(scatter))), quantile)
+        of_runs = None
+        if whole:
+            of_runs = rng.integers(len(fit.executions), size=shape)
+            of_runs[:, ::2] = -1
+            along = np.array([np.resize(run, horizon) for run in fit.executions])
+            rows[:, 1::2] = along[of_runs[:, 1::2]]
+        start = scatter * rng.standard_normal((*shape, len(scatter)))
+        return cls(fit, tuple(groups), rows, start, quantile, of_runs)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -59,8 +70,17 @@ class NoisyDraws(Draws):
     @functools.cached_property
     def searched(self) -> Self:
         """The same with fewer sequences of noise, with which a search finds the same tasks."""
-        few = self.replicates > ROUGH
-        return replace(self, rows=self.rows[:, :ROUGH], start=self.start[:, :ROUGH]) if few else self
+        rough = ROUGH * self.kinds
+        return self._first(rough) if self.replicates > rough else self
+
+    @property
+    def kinds(self) -> int:
+        """The number of kinds of sequences of noise, which take turns."""
+        return 1 if self.of_runs is None else 2
+
+    def _first(self, replicates: int) -> Self:
+        of_runs = None if self.of_runs is None else self.of_runs[:, :replicates]
+        return replace(self, rows=self.rows[:, :replicates], start=self.start[:, :replicates], of_runs=of_runs)
 
     def settled(self, rng: np.random.Generator) -> Self:
         """Return the same residuals with many other sequences of noise."""
@@ -72,7 +92,7 @@ class NoisyDraws(Draws):
     def without_noise(self) -> Self:
         """Return the same residuals without noise."""
         groups = tuple((features, weights, np.zeros_like(noise)) for features, weights, noise in self.groups)
-        return replace(self, groups=groups, rows=self.rows[:, :1], start=np.zeros_like(self.start[:, :1]))
+        return replace(self._first(1), groups=groups, start=np.zeros_like(self.start[:, :1]), of_runs=None)
 
     def __getitem__(self, rows: ArrayLike) -> Self:
         """Return some draws; their rows are in ascending order."""
@@ -83,7 +103,9 @@ class NoisyDraws(Draws):
             first += len(weights)
             if len(some):
                 groups.append((features, weights[some], noise[some]))
-        return replace(self, groups=tuple(groups), rows=self.rows[chosen], start=self.start[chosen])
+        of_runs = None if self.of_runs is None else self.of_runs[chosen]
+        rows, start = self.rows[chosen], self.start[chosen]
+        return replace(self, groups=tuple(groups), rows=rows, start=start, of_runs=of_runs)
 
     def begun(self, rows: Rows, tasks: int, start: Array) -> tuple[Array, Step]:
         """Return the first states, and a step that is called once for each step of the loops."""
@@ -92,11 +114,12 @@ class NoisyDraws(Draws):
 
     def reduced(self, distances: Array) -> Array:
         """Return the quantile over the noise of distances ``(S R, q)``, shape ``(S, q)``."""
-        of_draws = distances.reshape(len(self), self.replicates, -1)
-        if self.replicates == 1:
-            return np.asarray(of_draws[:, 0])
+        each = self.replicates // self.kinds
+        of_draws = distances.reshape(len(self), each, self.kinds, -1)
+        if each == 1:
+            return np.asarray(of_draws.max(axis=(1, 2)))
         ordered = np.sort(of_draws, axis=1)  # NaN, of a task that cannot be planned, is last in every sequence
-        return np.asarray(ordered[:, int(np.ceil(self.quantile * (self.replicates - 1)))])
+        return np.asarray(ordered[:, int(np.ceil(self.quantile * (each - 1)))].max(axis=1))
 
 
 class NoisyRuns:
@@ -137,7 +160,13 @@ class NoisyRuns:
             if self._noise.any():
                 steps = self._draws.rows.shape[2]
                 rows = self._draws.rows[self._of_draw, self._of_replicate, self._step % steps]
-                noise = fit.innovations[rows] * self._noise
+                unit = fit.innovations[rows]
+                if self._draws.of_runs is not None:
+                    runs = self._draws.of_runs[self._of_draw, self._of_replicate]
+                    whole = np.flatnonzero(runs >= 0)
+                    pairs = z[whole, : x.shape[-1] + fit.scaled.inputs]
+                    unit[whole] = fit.runs.within[rows[whole]] + fit.runs.of(runs[whole], pairs)
+                noise = unit * self._noise
                 if fit.local is not None:
                     noise *= fit.local(z[:, : fit.local.centres.shape[1]])[:, None]
                 record = predicted + noise

@@ -175,11 +175,14 @@ def rests_on(
     tests = details.get("tests", {})
     if tests.get("share_missed") is None:
         return text
+    what = of_tasks(certificate.distribution)
+    if details.get("quantile") is not None:
+        what = f"of the executions {what}"
     draws = [f"{counted(tests['spread'], 'test')} drawn as a Latin hypercube"] if tests["spread"] else []
     draws += [counted(tests["independent"], "independent draw")] if tests["independent"] else []
     return (
         f"{text} Without these assumptions, the tests alone show with {percent(certificate.confidence)} confidence "
-        f"only that at most {at_most(100 * tests['share_missed'], 2)} % {of_tasks(certificate.distribution)} exceed "
+        f"only that at most {at_most(100 * tests['share_missed'], 2)} % {what} exceed "
         f"{known.quantities.of(f'{tau:.6g}')} ({' and '.join(draws)})."
     )
 
@@ -197,6 +200,11 @@ def _evidence(certificate: Certificate, tau: float, quantities: Quantities) -> s
         if tests["largest_error"] is not None:
             within = at_most(100 * tests["largest_error"] / tau, 2)
             text += f", where the predictions made beforehand erred by at most {within} % of the threshold"
+    if (supported_share := details.get("share_supported")) is not None:
+        text += (
+            f"; without the learned noise, they support only that {100 * supported_share:.2g} % of such executions "
+            f"stay at or below the threshold, with {percent(certificate.confidence)} confidence"
+        )
     if left:
         text += f"; {left} of the {details['tasks']} tasks were not executed"
     text += "."

@@ -29,6 +29,32 @@ NOISE_CONTRADICTED = (
     "may be correlated, rare, or larger in some tasks, or a state that is not recorded acts; execute more tasks, or "
     "record more states"
 )
+UNEXPLAINED = (
+    "trial {trial} has the distance {distance:.4g}, and {expected:.4g} on the dynamics that all executions teach: they "
+    "do not explain it, because they depend on the task, on time or on a state that is not recorded; record more states"
+)
+CONTRADICTED = (
+    "the noise that all executions teach does not explain all of them (evidence {against:.3g}, and at most {most:g} is "
+    "allowed): the distance of trial {trial} has a probability of {p:.2g}; an execution of its task again helps "
+    "(`ctxval run` executes it)"
+)
+EXECUTED_ONCE = (
+    "the learned dynamics depend most on a task that was executed once, so a property of this execution may be taken "
+    "for one of the task; an execution of it again helps (`ctxval run` executes it)"
+)
+DRIFT = (
+    "executions differ by effects that change with {cause} (p-value {p:.2g}), and the learned noise assumes that they "
+    "do not; find the cause, or state a parameter that changes the dynamics (physical = [...])"
+)
+UNEVEN = (
+    "a joint at rest withstood {times:.2g} times a force that moved it elsewhere: friction at rest is not the same "
+    "everywhere or at any time, and its largest value is not known; use --kind posterior or an audit"
+)
+UNSUPPORTED = (
+    "{above} of {executions} executions exceed {level:.4g}, more than the learned noise explains (the likelihood "
+    "ratio of this noise against a share of {share:.3g} % above it is {ratio:.2g}, and at least 1 is needed); further "
+    "executions of these tasks help (`ctxval run` executes them)"
+)
 LEFT_OUT = (
     "the posterior samples of the dynamics understate the predictive uncertainty: they lack {percent:.0f} % of the "
     "largest posterior variance, and at most {most:g} % is allowed; more executions reduce it"
