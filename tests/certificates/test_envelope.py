@@ -119,7 +119,8 @@ def test_a_test_that_exceeds_its_prediction_raises_the_factor() -> None:
     raised = envelope(replace(evidence, predictions=predictions))
     assert usual.raised_by is None
     assert raised.raised_by == worse.trial
-    assert raised.factor == pytest.approx(0.08 / (0.02 / 1.645))
+    # Its excess is a fifth of its own distance of 0.4, so it is taken for as large a share of the threshold of 0.6.
+    assert raised.factor == pytest.approx(0.6 / 0.4 * 0.08 / (0.02 / 1.645))
     assert raised.share < usual.share
     drawn = drawn_from(POINTS)
     assert must_outlive_a_test(drawn, replace(evidence, predictions=predictions), 0.6)

@@ -72,7 +72,14 @@ def test_what_holds_a_joint_at_rest_is_bounded_by_what_it_withstood_and_what_set
         return sticky_step(x, acting, 0.0) - MODEL.step(x, acting)
 
     transitions = Transitions(x, inputs, step(x, inputs))
-    least, largest, passed = known.resting(transitions, missed)
+    least, largest, passed, uneven = known.resting(transitions, missed)
+    assert (uneven == 1).all()
+    # At another place, the joint withstands three times the force that moved it here.
+    caught = Transitions(np.array([[0.8, 0.0]]), np.array([[3.9]]), np.array([[0.8, 0.0]]))
+    together = (
+        np.concatenate(each) for each in zip(*((t.x, t.u, t.x_next) for t in (transitions, caught)), strict=True)
+    )
+    assert known.resting(Transitions(*together), missed)[3][1, 0] == pytest.approx(3.9 / 2.0, rel=0.05)
     assert least[:, 0] == pytest.approx([1.1, GRIP], abs=0.01)
     assert largest[:, 0] == pytest.approx([1.3, 2.0], abs=0.02)
     assert passed[0] > GRIP
@@ -190,7 +197,7 @@ def test_a_joint_that_creeps_while_it_is_held_is_found_to_do_so() -> None:
     # A joint that begins to creep does not move yet.
     start, push = np.array([[0.3, 0.0]]), np.array([[2.0]])
     x, u = np.concatenate([x, start]), np.concatenate([u[:, None], push])
-    least, largest, _ = friction.resting(Transitions(x, u, creeping(x, u)), lambda acting: np.zeros_like(x))
+    least, largest, *_ = friction.resting(Transitions(x, u, creeping(x, u)), lambda acting: np.zeros_like(x))
     assert least[:, 0] == pytest.approx(GRIP, rel=0.02)
     assert largest[1, 0] == pytest.approx(2.0, rel=0.05)
 

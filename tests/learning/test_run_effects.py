@@ -1,5 +1,7 @@
 """Tests of the effects of whole executions."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ def found(effects: np.ndarray, seed: int = 0, correlation: float = 0.0) -> RunEf
     rng = np.random.default_rng(seed)
     pairs, noise = rng.standard_normal((RUNS * STEPS, 3)), rng.standard_normal((RUNS * STEPS, 2))
     for run in ROWS:
-        for before, after in zip(run[:-1], run[1:], strict=True):
+        for before, after in pairwise(run):
             noise[after] = correlation * noise[before] + np.sqrt(1 - correlation**2) * noise[after]
         noise[run, 0] += effects[run[0] // STEPS, 0] + effects[run[0] // STEPS, 1] * pairs[run, 2]
     noise[:, 1] = 0.0

@@ -40,8 +40,10 @@ from ctxval._util.texts import enumerated
 from ctxval.certificates.drawn_distances import FLOOR, LARGEST, DrawnDistances
 from ctxval.certificates.dynamics_diagnostics import (
     PREDICTIONS,
+    SMALL,
     agrees,
     counted,
+    holds,
     missing_tests,
     most_beyond,
     tested,
@@ -253,8 +255,10 @@ def rises_of(evidence: DynamicsEvidence, threshold: float) -> list[tuple[float, 
     for each in last:
         if min(each.distance, each.median) <= threshold:
             spread = (each.upper - each.median) / 1.645  # the 0.95 quantile of a normal distribution
-            rise = each.excess / max(spread, 2 * FLOOR * threshold) if np.isfinite(each.upper) else 0.0
-            rises.append((rise, each))
+            # An error that is large for the test's own distance may be as large a share of one near the threshold.
+            scale = 1.0 if holds(evidence, each, threshold) else threshold / max(each.median, SMALL * threshold)
+            rise = max(scale, 1.0) * each.excess / max(spread, 2 * FLOOR * threshold)
+            rises.append((rise if np.isfinite(each.upper) else 0.0, each))
     return rises
 
 
