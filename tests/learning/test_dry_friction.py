@@ -75,11 +75,11 @@ def test_what_holds_a_joint_at_rest_is_bounded_by_what_it_withstood_and_what_set
     least, largest, passed, uneven = known.resting(transitions, missed)
     assert (uneven == 1).all()
     # At another place, the joint withstands three times the force that moved it here.
-    caught = Transitions(np.array([[0.8, 0.0]]), np.array([[3.9]]), np.array([[0.8, 0.0]]))
-    together = (
-        np.concatenate(each) for each in zip(*((t.x, t.u, t.x_next) for t in (transitions, caught)), strict=True)
-    )
-    assert known.resting(Transitions(*together), missed)[3][1, 0] == pytest.approx(3.9 / 2.0, rel=0.05)
+    place = np.array([[0.8, 0.0]])
+    at, pushes = np.concatenate([x, place]), np.concatenate([inputs, [[3.9]]])
+    caught = Transitions(at, pushes, np.concatenate([transitions.x_next, place]))
+    ratios = known.resting(caught, lambda acting: sticky_step(at, acting, 0.0) - MODEL.step(at, acting))[3]
+    assert ratios[1, 0] == pytest.approx(3.9 / 2.0, rel=0.05)
     assert least[:, 0] == pytest.approx([1.1, GRIP], abs=0.01)
     assert largest[:, 0] == pytest.approx([1.3, 2.0], abs=0.02)
     assert passed[0] > GRIP
