@@ -63,8 +63,6 @@ class DesignError(CtxvalError):
 class ExecutionError(CtxvalError):
     """An execution of the system S failed; a campaign records it as a failed trial."""
 
-    trajectory: object = None  #: the steps that were recorded before the failure; None if there are none
-
 
 class DistanceError(CtxvalError):
     """The distance failed or returned an unusable result."""

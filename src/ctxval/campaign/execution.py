@@ -197,8 +197,7 @@ class ExecutionLoop:
         try:
             execution = execution.measured(self.recorder.validation, opened.plan)
         except (ExecutionError, InputError) as error:
-            # A recording of a failed execution that is of another task does not hide why it failed.
-            failed, validation = Execution(failed=execution.failed or str(error)), self.recorder.validation
+            failed, validation = Execution(failed=str(error)), self.recorder.validation
             with suppress(InputError):
                 failed = Execution.before_failure(validation, opened.plan, execution.trajectory, str(error))
             execution = replace(failed, seconds=execution.seconds)

@@ -96,7 +96,7 @@ class SuppliedResult:
             with (folder / "answer").open("w+b") as answer, open(os.devnull, "wb") as nothing:
                 command = [sys.executable, "-P", str(_PROGRAM), str(folder)]
                 try:
-                    status = run_supervised(command, None, answer, nothing, 2 * seconds, 0.0)
+                    status = run_supervised(command, None, answer, nothing, 2 * seconds)
                 except ExecutionError as error:
                     raise InputError(f"{path} cannot be read: {error}.") from error
                 answer.seek(0)

@@ -29,7 +29,7 @@ from ctxval.core.plan import Plan
 from ctxval.core.system import System
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
-from ctxval.errors import CampaignError, ExecutionError, InputError
+from ctxval.errors import CampaignError, InputError
 
 _GRACE_PERIOD = 2.0  # seconds that a worker has to clean up before it is killed
 AHEAD = 0.5  #: seconds of work that is begun before its turn, if its choice depends on no result; Ctrl-C waits for it
@@ -45,9 +45,7 @@ def execute_task(system: System, controller: Controller, task: Task) -> Executio
     except BaseException as error:
         if raised_by_signal(error):
             raise
-        recorded = error.trajectory if isinstance(error, ExecutionError) else None
-        kept = recorded if isinstance(recorded, Trajectory) else None
-        return Execution(kept, failed=reason_of(error), seconds=time.perf_counter() - started)
+        return Execution(failed=reason_of(error), seconds=time.perf_counter() - started)
     return Execution(trajectory, seconds=time.perf_counter() - started)
 
 

@@ -1,8 +1,7 @@
 """A command as the true system: a rig's own program, a simulator, any language.
 
 Its child processes all end: with the command, at a timeout, and with the process that started it. If a command went on
-after ``kill -9`` of its campaign, it would move a rig at the same time as its own repetition. A command that must end
-first gets SIGTERM, so that it can stop its rig and write what it has recorded.
+after ``kill -9`` of its campaign, it would move a rig at the same time as its own repetition.
 """
 
 from __future__ import annotations
@@ -22,10 +21,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import IO
 
-import numpy as np
-
-from ctxval._util.arrays import Array
-from ctxval._util.checked import NonNegativeFloat, TimeLimit
+from ctxval._util.checked import TimeLimit
 from ctxval._util.files import temporary_folder
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
@@ -39,17 +35,15 @@ from ctxval.systems.episode import require_one
 
 _PROGRAM = Path(__file__).absolute().with_name("supervisor.py")
 
-_EXACT, _JITTER = 0.01, 0.25  # deviations from the times of the task, in steps, between which states are interpolated
-_MARGIN = 10.0  # seconds that a supervisor has, beyond the grace period, to end its command before it is killed itself
+_GRACE_PERIOD = 10.0  # seconds that a supervisor has to end its command before it is killed itself
 
 
 def run_supervised(
-    command: Sequence[str], folder: Path | None, stdout: IO[bytes], stderr: IO[bytes], timeout: float, grace: float
+    command: Sequence[str], folder: Path | None, stdout: IO[bytes], stderr: IO[bytes], timeout: float
 ) -> int | None:
     """Run a command, and end all processes that it started, however this call ends.
 
-    Return the exit status, negative for a signal; None if the command did not end in time. It has ``grace`` seconds
-    between SIGTERM and SIGKILL.
+    Return the exit status, negative for a signal; None if the command did not end in time and was killed.
     """
     if os.name != "posix":
         # Run a command on a system without process groups; processes that it starts may outlive it.
@@ -60,15 +54,12 @@ def run_supervised(
         except subprocess.TimeoutExpired:
             return None
         finally:
-            process.terminate()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(grace)
             process.kill()
             process.wait()
     descriptors = stdout.fileno(), stderr.fileno()
     # -I, because modules in the folder of the program have the same names as other modules. A session of its own,
     # because Ctrl-C is for the campaign, which ends after the running executions.
-    program = [sys.executable, "-I", "-S", str(_PROGRAM), str(os.getpid()), *map(str, (*descriptors, grace)), *command]
+    program = [sys.executable, "-I", "-S", str(_PROGRAM), str(os.getpid()), *map(str, descriptors), *command]
     with reworded("the command cannot be started", OSError, to=ExecutionError):
         supervisor = subprocess.Popen(
             program,
@@ -94,7 +85,7 @@ def run_supervised(
             raise ExecutionError("the process that watches the command was killed")
         return int(status)
     finally:
-        _end(supervisor, child, grace)
+        _end(supervisor, child)
 
 
 def _readable(stdout: IO[bytes], timeout: float) -> bool:
@@ -103,7 +94,7 @@ def _readable(stdout: IO[bytes], timeout: float) -> bool:
         return bool(selector.select(timeout if timeout < 1e6 else None))  # the system does not take years
 
 
-def _end(supervisor: subprocess.Popen[bytes], child: int, grace: float) -> None:
+def _end(supervisor: subprocess.Popen[bytes], child: int) -> None:
     """Make the supervisor end the remaining processes; if it does not, kill it and the command's group."""
     assert supervisor.stdin is not None
     assert supervisor.stdout is not None
@@ -112,7 +103,7 @@ def _end(supervisor: subprocess.Popen[bytes], child: int, grace: float) -> None:
     with contextlib.suppress(OSError):
         supervisor.stdin.close()
     try:
-        supervisor.wait(grace + _MARGIN)
+        supervisor.wait(_GRACE_PERIOD)
     except subprocess.TimeoutExpired:  # e.g. somebody stopped the supervisor by SIGSTOP
         supervisor.kill()
         supervisor.wait()
@@ -130,18 +121,16 @@ class Subprocess:
     Every execution has a new folder with ``task.json`` and the controller as ``controller.json`` and
     ``controller.npz`` (see :mod:`ctxval.core.exchange`). The command gets the path of that folder as its last argument.
     It writes ``trajectory.npz`` (times, states, inputs, optionally ended) or ``trajectory.csv`` (columns
-    ``t, x0, ..., u0, ...``, no inputs in the last row) into that folder, as a regular file. The times are measured. If
-    they deviate from those of the task by at most a quarter of a step, the states are interpolated, and otherwise the
-    execution has failed. The command runs in the folder that was the current folder when this object was made.
+    ``t, x0, ..., u0, ...``, no inputs in the last row) into that folder, as a regular file. The command runs in the
+    folder that was the current folder when this object was made.
 
-    If the exit status is not 0, the execution has failed, and the last line of stderr is the reason; a trajectory that
-    the command has written is kept with the failure. All processes that the command started end with it, and also if
-    this process ends in any way; on Linux this includes processes that left its process group.
+    If the exit status is not 0, the execution has failed, and the last line of stderr is the reason. All processes that
+    the command started end with it, and also if this process ends in any way; on Linux this includes processes that
+    left its process group.
 
     Args:
         command: the program and its arguments; a string is split like a shell does. No shell runs the command.
-        timeout: seconds after which the command must end.
-        grace: seconds between SIGTERM, at which a command stops its rig, and SIGKILL of all its processes.
+        timeout: seconds after which the command and all processes that it started are killed.
         states, inputs: names of the states and inputs with their units, for the files.
         keep: a folder in which the folders of all executions are kept, to examine failures.
         folder: folder in which the files that the command names are searched before the current one.
@@ -152,7 +141,6 @@ class Subprocess:
         command: str | Sequence[str],
         *,
         timeout: TimeLimit,
-        grace: NonNegativeFloat = 2.0,
         states: Mapping[str, str] | None = None,
         inputs: Mapping[str, str] | None = None,
         keep: str | Path | None = None,
@@ -168,7 +156,7 @@ class Subprocess:
             ]
         if not self.command or shutil.which(self._located[0]) is None:
             raise InputError(f"the command must begin with a program that can be run, got {self.command}.")
-        self.timeout, self.grace = timeout, grace
+        self.timeout = timeout
         self.states = None if states is None else dict(states)
         self.inputs = None if inputs is None else dict(inputs)
         require_names(states or (), inputs or ())
@@ -197,22 +185,17 @@ class Subprocess:
             home = self._home if self._home.is_dir() else None  # on another machine the folder may not exist
             # Output goes to files, because a grandchild that keeps a pipe open would make us wait for it.
             with (folder / "stdout.txt").open("wb") as stdout, (folder / "stderr.txt").open("w+b") as stderr:
-                status = run_supervised([*self._located, str(folder)], home, stdout, stderr, self.timeout, self.grace)
+                status = run_supervised([*self._located, str(folder)], home, stdout, stderr, self.timeout)
                 # The file is not opened again, because its name may now stand for another file.
                 stderr.seek(max(0, stderr.seek(0, os.SEEK_END) - 4096))
                 lines = stderr.read().decode("utf-8", "replace").splitlines() if status else []
-            if status == 0:
-                return _trajectory(folder, task)
-            reason = f"the command did not end within {self.timeout:g} s and was stopped"
-            if status is not None:
+            if status is None:
+                raise ExecutionError(f"the command did not end within {self.timeout:g} s and was killed")
+            if status:
                 how = f"was ended by {signal_name(-status)}" if status < 0 else f"ended with status {status}"
                 last = next((line.strip()[:300] for line in reversed(lines) if line.strip()), "nothing on stderr")
-                reason = f"the command {how}: {last}"
-            failure = ExecutionError(reason)
-            with contextlib.suppress(ExecutionError):
-                recorded = _recorded(folder, task)
-                failure.trajectory = _on_times(recorded, task.times[: len(recorded.times)])
-            raise failure
+                raise ExecutionError(f"the command {how}: {last}")
+            return _trajectory(folder, task)
 
 
 def signal_name(number: int) -> str:
@@ -222,28 +205,17 @@ def signal_name(number: int) -> str:
     return f"signal {number}"
 
 
-def _recorded(folder: Path, task: Task) -> Trajectory:
+def _trajectory(folder: Path, task: Task) -> Trajectory:
     shape = task.horizon + 1, task.initial_state.size
     with reworded("the command's trajectory cannot be used", InputError, OSError, MemoryError, to=ExecutionError):
         if os.path.lexists(folder / "trajectory.npz"):
-            return Trajectory.from_npz(folder / "trajectory.npz", shape=shape)
-        if os.path.lexists(folder / "trajectory.csv"):
-            return Trajectory.from_csv(folder / "trajectory.csv", most_rows=shape[0])
-    raise ExecutionError("the command ended well but wrote neither trajectory.npz nor trajectory.csv")
-
-
-def _trajectory(folder: Path, task: Task) -> Trajectory:
-    trajectory, shape = _recorded(folder, task), (task.horizon + 1, task.initial_state.size)
-    with reworded("the command's trajectory cannot be used", InputError, to=ExecutionError):
+            trajectory = Trajectory.from_npz(folder / "trajectory.npz", shape=shape)
+        elif os.path.lexists(folder / "trajectory.csv"):
+            trajectory = Trajectory.from_csv(folder / "trajectory.csv", most_rows=shape[0])
+        else:
+            raise ExecutionError("the command ended well but wrote neither trajectory.npz nor trajectory.csv")
         if trajectory.ended == COMPLETE:
             if trajectory.states.shape != shape:
                 raise InputError(f"it must have states of shape {shape}, got {trajectory.states.shape}")
-            trajectory = _on_times(trajectory, task.times)
             require_times(trajectory, task.times)
     return trajectory
-
-
-def _on_times(trajectory: Trajectory, times: Array) -> Trajectory:
-    """Return a recording with measured times that hardly deviate from the times of its task at these times."""
-    late = np.abs(trajectory.times - trajectory.times[0] - times).max() / (times[1] - times[0])
-    return trajectory.resampled(times) if _EXACT < late <= _JITTER else trajectory

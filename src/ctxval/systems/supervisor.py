@@ -6,10 +6,9 @@ reaper: a process that loses its parent becomes a child of this one, so that non
 children; the campaign's process may have some, so it cannot be the reaper. Nothing of ctxval is imported, and little
 else, because this file is started for every execution.
 
-Its arguments are the id of the campaign's process, the descriptors of the command's stdout and stderr, the seconds that
-the command has to end after SIGTERM, and the command. It writes two lines: the id of the command's process, and, after
-all its processes have ended, the exit status, negative for a signal. Any input on stdin, or its end, means that the
-command must be ended.
+Its arguments are the id of the campaign's process, the descriptors of the command's stdout and stderr, and the command.
+It writes two lines: the id of the command's process, and, after all its processes have ended, the exit status, negative
+for a signal. Any input on stdin, or its end, means that the command must be ended.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ _LINUX = sys.platform.startswith("linux")
 
 def main() -> None:
     """Run the command, until it ends or must be ended."""
-    parent, stdout, stderr, grace, *command = sys.argv[1:]
+    parent, stdout, stderr, *command = sys.argv[1:]
     if _LINUX:
         ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
     woken, wake = os.pipe()
@@ -50,8 +49,6 @@ def main() -> None:
             break
         if ready:
             os.read(woken, 4096)
-    if child not in statuses:
-        _terminate(child, statuses, woken, float(grace))
     _end(child, statuses)
     _say(str(os.waitstatus_to_exitcode(statuses[child])) if child in statuses else "lost")
 
@@ -81,18 +78,6 @@ def _reap(statuses: dict[int, int]) -> bool:
             statuses[pid] = status
     except ChildProcessError:
         return True
-
-
-def _terminate(child: int, statuses: dict[int, int], woken: int, grace: float) -> None:
-    """Ask the command to end, so that it can stop its rig, and wait for it; its processes are killed afterwards."""
-    last = time.monotonic() + grace
-    try:
-        os.killpg(child, signal.SIGTERM)
-    except OSError:
-        return
-    while not _reap(statuses) and child not in statuses and (left := last - time.monotonic()) > 0:
-        if select.select([woken], [], [], left)[0]:
-            os.read(woken, 4096)
 
 
 def _end(child: int, statuses: dict[int, int]) -> None:
