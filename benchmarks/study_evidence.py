@@ -1,7 +1,7 @@
 """How campaigns end on systems whose evidence is easily forgotten, and on regular noisy ones beside the version before.
 
 ``python benchmarks/study_evidence.py`` runs what is not stored yet, in the order of the groups, and prints a table,
-which ``reliability.py`` writes into ``docs/reliability.md``. A campaign of the first groups is false if it is validated.
+which ``reliability.py`` writes into ``docs/reliability.md``. A `validated` of the first groups is false.
 """
 
 from __future__ import annotations
