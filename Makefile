@@ -32,7 +32,7 @@ thorough: .venv/.test  ## `make test` with more seeds, sizes and examples; takes
 check: .venv/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/python docs/page_blocks.py
+	$(BIN)/python tests/page_blocks.py
 	$(BIN)/mypy
 
 reliability: .venv/.test  ## kill -9 and resume, KILLS times

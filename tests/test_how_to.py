@@ -17,15 +17,12 @@ from typing import Any
 import pytest
 import typer
 
-DOCS = Path(__file__).parents[1] / "docs"
-sys.path.insert(0, str(DOCS))
-from page_blocks import PAGES as EVERY_PAGE  # noqa: E402
-from page_blocks import blocks, python_files  # noqa: E402
-
-from ctxval.cli import app  # noqa: E402
-from ctxval.cli.config.settings import ExperimentSettings  # noqa: E402
-from ctxval.data import LogMapping  # noqa: E402
-from rig_cli import calling  # noqa: E402
+from ctxval.cli import app
+from ctxval.cli.config.settings import ExperimentSettings
+from ctxval.data import LogMapping
+from page_blocks import DOCS, blocks, python_files
+from page_blocks import PAGES as EVERY_PAGE
+from rig_cli import calling
 
 HOW_TO = sorted((DOCS / "how-to").glob("*.md"))
 PAGES = [*HOW_TO, *sorted(DOCS.glob("tutorials/*.md")), *sorted(DOCS.glob("explanation/*.md"))]

@@ -1,6 +1,6 @@
 """Writes the Python of the manual's pages to files, so that mypy finds the names in it that do not exist.
 
-``python docs/page_blocks.py`` writes docs/_build/blocks; `make check` does it before it calls mypy.
+``python tests/page_blocks.py`` writes docs/_build/blocks; `make check` does it before it calls mypy.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import re
 import shutil
 from pathlib import Path
 
-DOCS = Path(__file__).parent
+DOCS = Path(__file__).parents[1] / "docs"
 BLOCKS = DOCS / "_build" / "blocks"
 PAGES = [DOCS.parent / "README.md", *sorted(path for path in DOCS.rglob("*.md") if BLOCKS.parent not in path.parents)]
 
