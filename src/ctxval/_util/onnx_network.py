@@ -192,18 +192,24 @@ class GraphValue:
         squares = (self * self).affine(np.repeat(inverse[:, None], len(centres), axis=1), np.zeros(len(centres)))
         return (mixed + squares).node("Relu")
 
-    def write(self, path: str | Path, title: str, width: int, output: Self, name: str, output_width: int) -> None:
-        """Write the graph from this input, rows of ``width`` numbers, to an output with a name, to an ONNX file."""
-        helper, kind = self.onnx.helper, self.onnx.TensorProto.DOUBLE
-        self.nodes.append(helper.make_node("Identity", [output.name], [name]))
-        ends = [helper.make_tensor_value_info(n, kind, ["N", w]) for n, w in ((self.name, width), (name, output_width))]
-        graph = helper.make_graph(self.nodes, title, ends[:1], ends[1:], self.tensors)
+    def write(self, path: str | Path, title: str, width: int, outputs: dict[str, tuple[Self, str, list[Any]]]) -> Path:
+        """Write the graph whose input this is, rows of so many numbers, to an ONNX file.
+
+        The outputs are values by name, with their type (``DOUBLE`` or ``BOOL``) and shape; ``"N"`` stands for rows.
+        """
+        helper, kinds, ends = self.onnx.helper, self.onnx.TensorProto, []
+        for name, (value, kind, shape) in outputs.items():
+            self.nodes.append(helper.make_node("Identity", [value.name], [name]))
+            ends.append(helper.make_tensor_value_info(name, getattr(kinds, kind), shape))
+        given = helper.make_tensor_value_info(self.name, kinds.DOUBLE, ["N", width])
+        graph = helper.make_graph(self.nodes, title, [given], ends, self.tensors)
         # Versions that onnxruntime has read since 2022.
         opset = [helper.make_opsetid("", 17)]
         content = helper.make_model(graph, opset_imports=opset, ir_version=8, producer_name=MADE_BY)
         make_folder_of(path)
         with written_whole(path) as file:
             file.write(content.SerializeToString())
+        return Path(path)
 
     def __add__(self, other: Self | Array) -> Self:
         return self.node("Add", other)

@@ -84,7 +84,7 @@ def write_onnx(path: str | Path, model: Model) -> None:
     _require_onnx(model)
     z = GraphValue.first("z")
     following, n, m = _next_state(z, model)
-    z.write(path, "step", n + m, following, "x_next", n)
+    z.write(path, "step", n + m, {"x_next": (following, "DOUBLE", ["N", n])})
 
 
 def _require_onnx(model: Model | None) -> None:
