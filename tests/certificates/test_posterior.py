@@ -49,6 +49,7 @@ def test_a_certificate_says_its_error() -> None:
     assert certificate.covers(certificate.upper_bound + 2.001 * certificate.error)
 
 
+@pytest.mark.usefixtures("few_draws")
 def test_a_bound_that_a_far_task_withdraws_is_not_settled(monkeypatch: pytest.MonkeyPatch) -> None:
     settled = []
     monkeypatch.setattr(
