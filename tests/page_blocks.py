@@ -32,7 +32,7 @@ def python_files(page: Path) -> dict[str, str]:
 
 
 def main() -> None:
-    """Write the files anew."""
+    """Write the files."""
     shutil.rmtree(BLOCKS, ignore_errors=True)
     for page in PAGES:
         folder = BLOCKS / re.sub(r"\W", "_", str(page.relative_to(DOCS.parent).with_suffix("")))
