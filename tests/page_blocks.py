@@ -11,7 +11,12 @@ from pathlib import Path
 
 DOCS = Path(__file__).parents[1] / "docs"
 BLOCKS = DOCS / "_build" / "blocks"
-PAGES = [DOCS.parent / "README.md", *sorted(path for path in DOCS.rglob("*.md") if BLOCKS.parent not in path.parents)]
+WRITTEN = ("contributing.md", "changelog.md", "_build", "api", "auto_examples")
+"""Pages and folders that a build of the manual writes."""
+PAGES = [
+    DOCS.parent / "README.md",
+    *sorted(path for path in DOCS.rglob("*.md") if not {*path.relative_to(DOCS).parts} & {*WRITTEN}),
+]
 
 
 def blocks(page: Path) -> list[tuple[str, str]]:
