@@ -19,19 +19,20 @@ demo: .venv/.installed
 test: .venv/.test
 	$(MAKE) --jobs 2 check suite  # mypy has one thread
 
-suite: .venv/.test
+suite: .venv/.compiled
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
 
 quick: .venv/.test  ## everything that takes less than half a second, on all cores, for daily work
 	$(BIN)/python -m pytest -q -m "not slow" --numprocesses auto --dist worksteal
 
-thorough: .venv/.test  ## `make test` with more seeds, sizes and examples; takes about an hour
-	$(BIN)/python $(PIP) 'ray>=2.40'  # 240 MB
+thorough: .venv/.test lowest  ## `make test` with more seeds, sizes and examples; takes about an hour
+	$(BIN)/python $(PIP) --editable '.[docs]' 'ray>=2.40'  # 240 MB
 	$(BIN)/python -m pytest --thorough --numprocesses auto --dist worksteal
 
 check: .venv/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python tests/page_blocks.py
 	$(BIN)/mypy
 
 reliability: .venv/.test  ## kill -9 and resume, KILLS times
@@ -70,6 +71,7 @@ study-refine: .venv/.test  ## how much better refined models are; writes docs/re
 	$(BIN)/python benchmarks/study_refine.py
 
 docs: .venv/.test  ## the manual, with its gallery; writes docs/_build/html, and looks for broken links
+	$(BIN)/python $(PIP) --editable '.[docs]'
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 	$(BIN)/python -m pytest -q --thorough --manual=docs/_build/html tests/test_manual_pages.py tests/test_how_to.py -k "manual_is_built or accessible or blocks"
 
@@ -163,6 +165,10 @@ clean:
 .venv/.test: pyproject.toml | .venv/bin/python
 	$(BIN)/python $(PIP) --editable '.[test]'
 	touch $@ .venv/.installed
+
+.venv/.compiled: .venv/.test  # by one process, because those of the suite would each compile all of it
+	$(BIN)/python -m pytest -qq --collect-only > /dev/null || true  # the suite says what is wrong
+	touch $@
 
 .venv/lowest/.installed: pyproject.toml | .venv/bin/python
 	$(BIN)/python -m venv $(@D)

@@ -32,6 +32,7 @@ from ctxval import (
     searches,
     systems,
 )
+from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 
 DT = 0.05
@@ -79,7 +80,7 @@ def network(activation: str) -> Validation:
         warnings.simplefilter("ignore")  # the training stops at its limit
         model = models.ScikitLearn.fit(regressor, Transitions(x, u, step(x, u)))
 
-    def execute(controller: controllers.Controller, task: Task) -> Trajectory:
+    def execute(controller: Controller, task: Task) -> Trajectory:
         return rollout(lambda state, action: np.array(step(state, action).tolist()), controller, task)
 
     return Validation(

@@ -38,7 +38,7 @@ def tracking(entry: Entry, seed: int) -> float:
     """Return the median over tasks of how much of the initial deviation from the goal M's closed loop removes."""
     validation = entry(seed).validation
     parameters = validation.space.parameters(validation.space.iid(500, np.random.default_rng(1)))
-    plan = validation._plan(parameters)
+    plan = validation.plan_of(parameters, validation.task_at(parameters))
     ends = np.linalg.norm(plan.model_trajectory.final_state - plan.task.goal, axis=-1)
     begins = np.linalg.norm(plan.task.initial_state - plan.task.goal, axis=-1)
     return float(np.median(ends / np.maximum(begins, 1e-9)))

@@ -17,6 +17,7 @@ from ctxval import Experiment, Task, Trajectory, Transitions, Validation, rollou
 from ctxval._util.arrays import Array
 from ctxval.core.controller import Controller
 from ctxval.core.model import Step
+from ctxval.systems.functions import Derivative
 from misleading import PartlySeen
 
 FAMILIES = ("smooth", "prior", "hidden", "contact", "stick-slip", "saturation", "switch", "cliff", "noise")
@@ -71,7 +72,7 @@ def listed(*entries: Entry) -> dict[str, Entry]:
     return by_name
 
 
-def simulated(derivative: systems.Derivative, dt: float, substeps: int = 1) -> systems.Simulated:
+def simulated(derivative: Derivative, dt: float, substeps: int = 1) -> systems.Simulated:
     """Return the system with this derivative; each step of it is that many steps of Runge-Kutta."""
     return systems.Simulated(repeated(systems.rk4(derivative, dt / substeps), substeps), vectorized=True)
 

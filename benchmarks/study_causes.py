@@ -46,7 +46,8 @@ def faults(robot: Robot, of: str) -> list[Fault]:
 
 def is_right(robot: Robot, fault: Fault, cause: Cause) -> bool:
     """Return whether a cause is the fault, at its place."""
-    place, joints = fault.place, robot.joints if robot.mjcf is None else robot.model.compiled.nq
+    place, compiled = fault.place, getattr(robot.model, "compiled", None)
+    joints = robot.joints if compiled is None else compiled.nq
     attributes = {"viscous friction": "damping", "Coulomb friction": "frictionloss", "armature": "armature"}
     if isinstance(cause, causes.JointAttribute):
         return attributes.get(fault.kind) == cause.attribute and cause.joint.dof == place

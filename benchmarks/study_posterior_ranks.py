@@ -78,7 +78,7 @@ class PriorResidual:
         """Return the values ``(q, n)`` at standardised pairs ``(q, k)``, given all values that were drawn before."""
         cross = solve_triangular(self._factor, self._rough(self._pairs, Z), lower=True)
         values, vectors = np.linalg.eigh(self._rough(Z, Z) - cross.T @ cross)
-        own = np.linalg.qr((vectors * np.sqrt(np.maximum(values, _JITTER))).T, mode="r").T
+        own = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, _JITTER))).T, mode="r")).T
         white = self._rng.standard_normal((len(Z), self._white.shape[1]))
         self._factor = np.block([[self._factor, np.zeros((len(self._pairs), len(Z)))], [cross.T, own]])
         self._pairs, self._white = np.concatenate([self._pairs, Z]), np.concatenate([self._white, white])

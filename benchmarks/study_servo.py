@@ -89,7 +89,9 @@ def decide(run: Run) -> dict[str, Any]:
 
 def of_model(model: str) -> dict[str, Any]:
     """Return the distances of all recordings from a model."""
-    named = zip(validation(model).space.task_names, all_distances(model), all_distances(model, rms=True), strict=True)
+    tasks = validation(model).space
+    assert isinstance(tasks, TaskSuite)
+    named = zip(tasks.task_names, all_distances(model), all_distances(model, rms=True), strict=True)
     return {"model": model, "distances": {name: [float(largest), float(rms)] for name, largest, rms in named}}
 
 

@@ -97,6 +97,7 @@ def with_data(seed: int) -> Experiment:
     """Return the same with eight transitions of the system from small states, too few to determine it."""
     found, rng = paper(seed), np.random.default_rng([seed, 43])
     system, push = found.validation.system, 0.3 * rng.normal(size=(8, STATES))
+    assert isinstance(system, systems.Simulated)
     found.validation.model.data = rollout(  # type: ignore[attr-defined]
         system.model.step, lambda t, x: push[t], Task(0.3 * rng.normal(size=STATES), horizon=8, dt=Settings().dt)
     ).transitions()

@@ -45,7 +45,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 pytest_plugins = ["browser"]
 """Fixtures that tests of several folders use."""
 
-settings.register_profile("short", deadline=None, derandomize=True, max_examples=20)
+settings.register_profile("short", deadline=None, derandomize=True, max_examples=12)
 settings.register_profile("thorough", deadline=None, derandomize=True, max_examples=300)
 settings.load_profile("short")
 
@@ -53,7 +53,7 @@ settings.load_profile("short")
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--thorough", action="store_true", help="what `make thorough` runs: more seeds and sizes")
     parser.addoption("--manual", help="a folder with the built manual, whose pages are checked")
-    parser.addoption("--kills", type=int, default=2, help="how many campaigns are killed and resumed")
+    parser.addoption("--kills", type=int, default=1, help="how many campaigns are killed and resumed")
     parser.addoption("--switches", type=int, default=1, help="how often two processes on one store are switched")
 
 

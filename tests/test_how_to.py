@@ -8,15 +8,22 @@ import shlex
 import signal
 import subprocess
 import sys
+import tomllib
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 
+from ctxval.cli import app
+from ctxval.cli.config.settings import ExperimentSettings
+from ctxval.data import LogMapping
+from page_blocks import DOCS, blocks, python_files
+from page_blocks import PAGES as EVERY_PAGE
 from rig_cli import calling
 
-DOCS = Path(__file__).parents[1] / "docs"
 HOW_TO = sorted((DOCS / "how-to").glob("*.md"))
 PAGES = [*HOW_TO, *sorted(DOCS.glob("tutorials/*.md")), *sorted(DOCS.glob("explanation/*.md"))]
 PAGES += sorted(DOCS.glob("reference/*.md"))
@@ -33,11 +40,6 @@ LONG += ("choose-threshold", "decide", "experiment-file", "fmu", "operate", "rep
 LONG += ("replay",)  # an example and a script of the gallery replay recordings, too
 """Pages that only `make docs` and `make thorough` run: long campaigns, several of them, or many processes."""
 CTXVAL = ["-c", "from ctxval.cli import main; main()"]
-
-
-def blocks(page: Path) -> list[tuple[str, str]]:
-    """Return the languages and contents of a page's blocks."""
-    return re.findall(r"^```(\w+)\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
 
 
 def require_server(command: list[str]) -> None:
@@ -110,6 +112,56 @@ def test_the_blocks_of_a_page_run(page: Path) -> None:
         else:
             assert language == "python", f"{page.name} has a block that nobody runs: {language}"
             exec(compile(content, page.name, "exec"), names)
+
+
+@pytest.mark.parametrize("page", EVERY_PAGE, ids=lambda page: page.stem)
+def test_commands_and_files_of_a_page_have_names_that_exist(page: Path) -> None:
+    """Without running them, which only `make docs` does on every page."""
+    for language, content in blocks(page):
+        if language == "console":
+            for line in content.splitlines():
+                parse_command(line)
+        elif language == "toml":
+            table = tomllib.loads(content)
+            is_mapping = "mapping.toml" in content.partition("\n")[0] or "observer" in table
+            (LogMapping.from_table if is_mapping else ExperimentSettings.model_validate)(table)
+
+
+def parse_command(line: str) -> None:
+    """Check the command and its options, if a line calls ``ctxval``."""
+    program, *arguments = shlex.split(line.removeprefix("$ ").removesuffix(" &"), comments=True) or [""]
+    if program.rpartition("/")[2] != "ctxval":
+        return
+    group: Any = typer.main.get_command(app)
+    name, command, rest = group.resolve_command(group.context_class(group), arguments)
+    command.make_parser(command.context_class(command, info_name=name)).parse_args(rest)
+
+
+@pytest.mark.parametrize("line", ["runs pendulum", "run pendulum --bugdet 3"])
+def test_a_command_or_an_option_that_does_not_exist_is_noticed(line: str) -> None:
+    with pytest.raises(Exception, match="No such"):
+        parse_command(f"$ ctxval {line}")
+
+
+@pytest.mark.slow
+@pytest.mark.thorough
+def test_mypy_finds_names_that_do_not_exist_in_scripts_and_in_pages(tmp_path: Path) -> None:
+    """`make check` checks the manual, the examples and the benchmarks; each of these contents of a file is wrong."""
+    page = tmp_path / "page.md"
+    page.write_text("```python\nimport ctxval\nctxval.Task([0.0], goal=[0.0], horizont=3)\n```\n")
+    wrong = {
+        "docs/conf.py": python_files(page)["page.py"],
+        "examples/gallery/plot_4_linear.py": "from ctxval.no_such_module import Task\n",
+        "benchmarks/walks.py": "import ctxval\n\n\ndef untyped(pair):\n    return ctxval.Task.no_such_name\n",
+        "src/ctxval/__main__.py": "def untyped(x):\n    return x\n",
+    }
+    command = [sys.executable, "-m", "mypy"]
+    for number, (name, content) in enumerate(wrong.items()):
+        (tmp_path / f"{number}.py").write_text(content)
+        command += ["--shadow-file", name, str(tmp_path / f"{number}.py")]
+    done = subprocess.run([*command, *wrong], capture_output=True, text=True, cwd=DOCS.parent, check=False)
+    for name in wrong:
+        assert f"{name}:" in done.stdout, done.stdout + done.stderr
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -199,9 +199,7 @@ def checked(tree: Path, folder: Path) -> dict[str, tuple[int, str, str]]:
 
 
 @pytest.mark.slow
-def test_parts_pass_the_tests_of_all_parts_and_are_found_in_experiment_files_and_in_the_page(
-    tree: Path, tmp_path: Path
-) -> None:
+def test_parts_are_found_in_experiment_files_and_in_the_page(tree: Path, tmp_path: Path) -> None:
     """One test, because each process of the suite that ran a part of it would make a copy of the tree."""
     said_of = checked(tree, tmp_path)
     for part, recipe in RECIPES.items():
@@ -213,7 +211,14 @@ def test_parts_pass_the_tests_of_all_parts_and_are_found_in_experiment_files_and
         assert f"| `{name}` |" in (tree / "docs" / "parts.md").read_text()
         assert f"| `{name}` |" not in (ROOT / "docs" / "parts.md").read_text()
     own = [recipe.test for recipe in RECIPES.values()]
-    done = run(tree, "pytest", "-q", "-p", "no:cacheprovider", "-k", NOT_OF_PARTS, *own, *TESTS)
+    done = run(tree, "pytest", "-q", "-p", "no:cacheprovider", *own)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.thorough
+def test_parts_pass_the_tests_of_all_parts(tree: Path, tmp_path: Path) -> None:
+    checked(tree, tmp_path)
+    done = run(tree, "pytest", "-q", "-p", "no:cacheprovider", "-k", NOT_OF_PARTS, *TESTS)
     assert done.returncode == 0, done.stdout + done.stderr
 
 

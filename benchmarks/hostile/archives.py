@@ -229,7 +229,7 @@ def runs_csv(rng: Rng) -> bytes:
         "a" * 300,
     )
     kinds = ("trajectory", "distance", "failed")
-    rows = []
+    rows: list[list[Any]] = []
     for _ in range(int(rng.integers(1, 6))):
         kind = int(rng.integers(3))
         result = ["", "", ""]
@@ -237,7 +237,7 @@ def runs_csv(rng: Rng) -> bytes:
         rows.append([1.0 + rng.random(), 0.2 * rng.random(), *result])
     content = table(rng, ["goal", "load", *kinds], rows)
     if rng.random() < 0.3:
-        lines = [["goal", "load", *kinds], *rows]
+        lines: list[list[Any]] = [["goal", "load", *kinds], *rows]
         content = "\n".join(",".join(f'"{cell}"' for cell in line) for line in lines).encode("utf-8", "replace")
     return content
 

@@ -35,7 +35,7 @@ def cart(synthesizer):
 candidates = {"gentle": cart(controllers.LQR([1, 1], [1])), "stiff": cart(controllers.LQR([100, 1], [0.1]))}
 result = ctxval.compare(candidates, question="both", budget=60, confidence=0.95)
 for pair in result.pairs:
-    print(f"{pair.answer}: {pair.reason}")
+    print(f"{pair.question}: {pair.reason}")
 
 # %%
 # The dots are executed distances, which are facts. The bar is the bound on d* that the decision needed: only the

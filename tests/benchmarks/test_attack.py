@@ -115,6 +115,7 @@ def test_the_cage_notices(code: str, wrong: str, monkeypatch: pytest.MonkeyPatch
     assert wrong in ran(monkeypatch, tmp_path, lambda: exec(code, NAMES))
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_what_never_ends_is_ended(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(cage, "CPU", 1)

@@ -81,6 +81,7 @@ def test_a_renamed_file_has_one_of_its_names() -> None:
 # Campaigns
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @needs_strace
 @pytest.mark.parametrize(

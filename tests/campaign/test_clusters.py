@@ -76,7 +76,7 @@ def trials_of_recipe(folder: Path, recipe: str, struck_by: signal.Signals) -> li
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("recipe", "package"), [("dask", "distributed"), *more(("slurm", "submitit"), ("ray", "ray"))])
+@pytest.mark.parametrize(("recipe", "package"), more(("dask", "distributed"), ("slurm", "submitit"), ("ray", "ray")))
 def test_nothing_is_lost_if_a_worker_is_killed(tmp_path: Path, recipe: str, package: str) -> None:
     require(package)
     trials = trials_of_recipe(tmp_path, recipe, signal.SIGKILL)

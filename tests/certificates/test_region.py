@@ -24,7 +24,7 @@ from ctxval.certificates import (
 from ctxval.errors import CertificateError
 from rig_thorough import more
 
-CAMPAIGNS = 100_000
+CAMPAIGNS = 20_000
 FLAT = Predicted(lambda points: np.full(len(points), 0.5))
 SLOPE = Predicted(lambda points: points[:, 0])
 
@@ -55,7 +55,7 @@ def draws(distances: list[float], learned: Predicted | None = FLAT, planned: lis
 @pytest.mark.slow
 @pytest.mark.parametrize(("beta", "discarded"), [(0.05, 2), *more((0.05, 0), (0.2, 0), (0.2, 2))])
 def test_the_margin_holds_as_often_as_stated(beta: float, discarded: int) -> None:
-    """1e5 campaigns of 40 draws, whose prediction is learned from 5 trials before them and differs in each."""
+    """Many campaigns of 40 draws, whose prediction is learned from 5 trials before them and differs in each."""
     rng, n = np.random.default_rng(3), 40
 
     def distance(p: np.ndarray) -> np.ndarray:
@@ -80,7 +80,7 @@ def test_the_margin_holds_as_often_as_stated(beta: float, discarded: int) -> Non
 
 @pytest.mark.parametrize("beta", [0.05, *more(0.2)])
 def test_the_volume_above_a_threshold_is_exceeded_as_rarely_as_stated(beta: float) -> None:
-    """Draws and map together: 1e5 campaigns, in which the true volume above the threshold is known.
+    """Draws and map together: many campaigns, in which the true volume above the threshold is known.
 
     The distance is uniform, with a prediction that is off by an independent uniform error.
     """

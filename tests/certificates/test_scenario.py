@@ -81,7 +81,7 @@ def test_the_number_needed_is_the_least(volume: float, beta: float, discarded: i
 @pytest.mark.parametrize("discarded", [3, *more(0)])
 def test_the_stated_confidence_is_the_measured_coverage(discarded: int) -> None:
     rng = np.random.default_rng(discarded)
-    held, runs, n = 0, 4000, 40
+    held, runs, n = 0, 1500, 40
     for _ in range(runs):
         certificate = scenario(sample(rng.random(n).tolist()), 0.9, discarded)
         held += 1 - certificate.upper_bound <= certificate.volume

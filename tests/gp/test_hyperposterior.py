@@ -165,7 +165,7 @@ def test_a_length_scale_is_drawn_from_its_posterior() -> None:
     y = np.sin(6 * X[:, 0])
     prior = Prior(length_scale=0.5, noise=(1e-4, 1e-4), offset=None)
     grid, weights = quadrature(prior, X, y)
-    draws = draw_hyperparameters(X, y, 250, np.random.default_rng(5), prior)
+    draws = draw_hyperparameters(X, y, 120, np.random.default_rng(5), prior)
     drawn, exact = log_scales(draws)[:, 0], weights.sum(axis=0)
     mean = exact @ grid
     deviation = np.sqrt(exact @ (grid - mean) ** 2)
@@ -383,7 +383,7 @@ def test_maxima_in_many_dimensions_are_found_but_for_a_little(d: int, missed: fl
     )
     paths = draw_paths(conditioned, X, 4, rng)
     tops, _ = maxima(paths, X, rng)
-    starts = rng.random((4, 150, d))
+    starts = rng.random((4, 60, d))
 
     def negative(flat: np.ndarray) -> tuple[float, np.ndarray]:
         values, slopes = paths.own_with_gradient(flat.reshape(starts.shape))

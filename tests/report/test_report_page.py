@@ -20,7 +20,7 @@ from ctxval import Campaign, Trial, report
 from ctxval.certificates import CertificateOptions, Posterior, Region
 from ctxval.errors import InputError
 from ctxval.report import ReportContext, context_of_campaign, context_of_store
-from ctxval.report.sections.repeat import appendix, command_of, identity, python_snippet
+from ctxval.report.sections.repeat import command_of, identity, python_snippet
 from ctxval.report.sections.trials import packed, recorded_lines
 from rig_thorough import more
 
@@ -41,7 +41,7 @@ def test_the_page_has_all_sections_in_their_order(html: str) -> None:
     titles = re.findall(r"<h2 id=\"heading-\d\"[^>]*>([^<]*)</h2>", html)
     assert titles == [
         "Verdict", "Assumptions and diagnostics", "Insights", "Distance over the tasks", "Trials", "Convergence",
-        "To repeat it", "For the file",
+        "To repeat it",
     ]  # fmt: skip
     assert "cannot be shown" not in html
     assert "could not be computed" not in html
@@ -217,7 +217,7 @@ def test_a_section_that_fails_says_why_and_the_others_are_shown(swing: ReportCon
 
     found = report.page(swing, [Weather(fail)])
     assert "This section cannot be shown: ValueError: no &lt;wind&gt;." in found
-    assert "For the file" in found
+    assert "To repeat it" in found
 
 
 def test_what_is_no_section_is_refused(swing: ReportContext) -> None:
@@ -250,7 +250,6 @@ def test_the_json_has_everything_that_decides(swing: ReportContext) -> None:
     found = report.to_json(swing)
     assert (found["verdict"], found["threshold"], found["executions"]) == ("falsified", 0.2, 9)
     assert found["worst"][0]["distance"] == pytest.approx(float(swing.distances.max()))
-    assert {entry["term"] for entry in found["appendix"]} >= {"Intended use", "Referent data", "Assumptions"}
     assert found["insights"]
 
 
@@ -270,13 +269,6 @@ def test_markdown_names_the_verdict_and_the_worst_tasks(swing: ReportContext) ->
     assert words.startswith("# Validation of pendulum")
     assert "**falsified: trial" in words
     assert "| trial | distance | goal" in words
-
-
-def test_the_appendix_covers_the_vocabulary_of_both_standards(swing: ReportContext) -> None:
-    entries = list(appendix(swing))
-    assert all(entry.content.strip() for entry in entries)
-    for standard in ("NASA-STD-7009B", "ASME V&V 10", "ASME V&V 20"):
-        assert any(standard in entry.standard for entry in entries)
 
 
 def test_the_identity_has_digests_of_the_parts(swing: ReportContext) -> None:

@@ -560,6 +560,7 @@ name = "gp-ucb"
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_costs")
 @pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)

@@ -169,12 +169,12 @@ class GraphValue:
         """Return the input of a new graph, rows of numbers."""
         return cls(name, require_onnx(), [], [])
 
-    def node(self, kind: str, *others: Self | Array, output: int = 0, **attributes: Any) -> Self:
-        """Return one of the results of an operation on this value and others; constants are broadcast."""
+    def node(self, kind: str, *others: Self | Array) -> Self:
+        """Return the result of an operation on this value and others; constants are broadcast."""
         names = [(each if isinstance(each, GraphValue) else self.constant(each)).name for each in (self, *others)]
-        results = [f"value_{len(self.nodes)}_{k}" for k in range(output + 1)]
-        self.nodes.append(self.onnx.helper.make_node(kind, names, results, **attributes))
-        return replace(self, name=results[-1])
+        result = replace(self, name=f"value_{len(self.nodes)}")
+        self.nodes.append(self.onnx.helper.make_node(kind, names, [result.name]))
+        return result
 
     def constant(self, values: Array) -> Self:
         """Return a constant of this graph."""

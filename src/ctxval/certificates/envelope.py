@@ -58,7 +58,6 @@ from ctxval.certificates.envelope_shape import (
     TrustedRegion,
     exported,
     regions_inside,
-    write_onnx,
 )
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.sentences.statements import IRREGULAR, dynamics_assumptions, envelope_statement
@@ -168,22 +167,16 @@ class Envelope(ShortRepr):
         }
 
     def save(self, path: str | Path) -> Path:
-        """Write the interpolated function ``trusted(task) -> bool, bound`` to a file ``.py`` or ``.onnx``.
-
-        A Python file needs NumPy alone. An ONNX file, which the package onnx writes (extra ``fit``), has the input
-        ``task`` ``(N, d)`` and the outputs ``trusted`` and ``bound`` ``(N,)``.
+        """Write the interpolated function ``trusted(task) -> bool, bound`` to a file ``.py``, which needs NumPy alone.
 
         Raises:
             InputError: if the path has another suffix, nothing is trusted, or the task space is a suite.
         """
-        suffix = Path(path).suffix
-        if suffix not in (".py", ".onnx"):
-            raise InputError(f"the envelope is written to a file such as envelope.py or .onnx, got {str(path)!r}.")
+        if Path(path).suffix != ".py":
+            raise InputError(f"the envelope is written to a file such as envelope.py, got {str(path)!r}.")
         if self._surfaces is None:
             reason = "the tasks of a suite are a list" if self.tasks is not None else "no task is trusted"
             raise InputError(f"there is no function to write: {reason}.")
-        if suffix == ".onnx":
-            return write_onnx(path, self._surfaces, self.space, self.threshold)
         return write_text(path, exported(self._surfaces, self.space, self.statement, self.threshold, self.confidence))
 
 

@@ -17,7 +17,6 @@ import io
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations, product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,6 @@ from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.files import MADE_BY
-from ctxval._util.onnx_network import GraphValue
 from ctxval._util.texts import parted
 from ctxval.core.space import TaskSpace
 
@@ -213,30 +211,6 @@ def exported(surfaces: Surfaces, space: TaskSpace, statement: str, threshold: fl
         weights=literal(surfaces.weights),
         errors=literal(surfaces.errors),
     )
-
-
-def write_onnx(path: str | Path, surfaces: Surfaces, space: TaskSpace, threshold: float) -> Path:
-    """Write a graph that computes what the exported Python does, up to rounding, for planners in other languages."""
-    task, d = GraphValue.first("task"), space.dimension
-    width = space.high - space.low
-    unit = task.affine(np.diag(1 / width), -space.low / width)
-    outermost = unit.node("Sub", np.array(0.5)).node("Abs").node("ReduceMax", axes=[1], keepdims=0)
-    inside = outermost.node("LessOrEqual", np.array(0.5 + 1e-9))
-
-    limited = unit.node("Min", np.array(1.0)).node("Max", np.array(0.0)).affine(np.diag(surfaces.scales), np.zeros(d))
-    squares = limited.squared_distances(surfaces.centres, np.ones(d))
-    K, c = surfaces.errors.shape
-    smooth = (squares * squares.node("Sqrt")).affine(surfaces.weights[:K], surfaces.weights[K])
-    smooth += limited.affine(surfaces.weights[K + 1 :], np.zeros(c))
-    nearest = squares.node("TopK", np.array([min(2 * (d + 1), K)]), output=1, axis=1, largest=0)
-    errors = nearest.constant(surfaces.errors).node("Gather", nearest, axis=0)
-    upper = smooth + errors.node("ReduceMax", axes=[1], keepdims=0)
-
-    below = upper.node("ReduceMax", axes=[1], keepdims=0).node("LessOrEqual", np.array(1.0))
-    trusted = inside.node("And", below)
-    first = upper.affine(threshold * np.eye(c)[:, :1], np.zeros(1)).node("ReduceMax", axes=[1], keepdims=0)
-    bound = trusted.node("Where", first.node("Max", np.array(0.0)), np.array(np.inf))
-    return task.write(path, "envelope", d, {"trusted": (trusted, "BOOL", ["N"]), "bound": (bound, "DOUBLE", ["N"])})
 
 
 # The largest boxes inside a set of tasks

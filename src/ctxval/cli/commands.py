@@ -61,7 +61,7 @@ class Commands(TyperGroup):
             for name, (_, *paragraphs) in names.items():
                 command = loaded.get(name) or TyperCommand(name)
                 command.help = "\n\n".join(paragraphs)
-                vars(command)["rich_help_panel"] = panel
+                vars(command).update(rich_help_panel=panel, hidden=name in TEXTS["hidden"])
                 self.commands[name] = command
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:

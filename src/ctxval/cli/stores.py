@@ -219,8 +219,7 @@ def state_envelope(
     out_: Path | None = None,
     force: bool = False,
 ) -> Any:
-    suffix = ".onnx" if out_ is not None and out_.suffix == ".onnx" else ".py"
-    base.require_outputs({f"--out {suffix}": out_}, [store, allowed.experiment], force=force)
+    base.require_outputs({"--out .py": out_}, [store, allowed.experiment], force=force)
     loaded = open_store(store, allowed)
     limit, _ = Limits(threshold).completed_by(loaded.settings, loaded.experiment)
     if limit is None:

@@ -38,7 +38,7 @@ class Experiment:
     threshold: PositiveFloat | None = None  #: the default threshold tau; without a threshold there is no verdict
     truth: Callable[[], Truth] | None = None  #: a function that finds d*, for simulated systems
     units: str = ""  #: the units of the distance
-    #: states, inputs: names of the states and inputs with their units; by default the labels of the validation
+    #: names of the states and inputs with their units; by default the labels of the validation
     states: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
 

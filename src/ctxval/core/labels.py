@@ -16,7 +16,7 @@ from ctxval.errors import InputError
 class Labels(ShortRepr):
     """Names and units, which change nothing that is computed."""
 
-    #: states, inputs: one label ``name [unit]`` for each state and each input; empty if they have no names
+    #: one label ``name [unit]`` for each state and each input; empty if they have no names
     states: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
     units: str = ""  #: the units of the distance

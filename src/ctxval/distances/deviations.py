@@ -34,7 +34,7 @@ class StateNorm(NamedStates):
     weights: Sequence[float] | None = None  #: one number >= 0 for each compared state; 1 by default
     #: the unit of comparison of each compared state, a positive number; 1 by default
     scales: Sequence[float] | None = None
-    #: the states that are angles in radians, by index or name: the difference is taken on the circle, so it is at most
+    #: the states that are angles in radians, by index or name; the difference is taken on the circle, so it is at most
     #: pi
     angles: Sequence[int | str] = ()
 

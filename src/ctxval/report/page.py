@@ -64,7 +64,6 @@ SECTIONS: tuple[Section, ...] = (
     _Part("Trials", trials),
     _Part("Convergence", convergence),
     _Part("To repeat it", repeat.repeat),
-    _Part("For the file", repeat.for_the_file),
 )
 """The sections of every report, in their order."""
 
@@ -148,7 +147,7 @@ def now() -> str:
 
 
 def to_json(context: ReportContext) -> dict[str, Any]:
-    """Return the verdict, the findings, the worst tasks, what repeats them, and the appendix, ready for JSON."""
+    """Return the verdict, the findings, the worst tasks and what repeats them, ready for JSON."""
     verdict, certificate = context.verdict, context.certificate
     with np.errstate(all="ignore"):  # a store may have any numbers
         report = {
@@ -175,7 +174,6 @@ def to_json(context: ReportContext) -> dict[str, Any]:
             ],
             "command": repeat.repeating_command(context) or None,
             "identity": repeat.identity(context),
-            "appendix": [entry._asdict() for entry in repeat.appendix(context)],
         }
         plain: dict[str, Any] = json.loads(json.dumps(describe(report, depth=12), allow_nan=False))
     return plain
@@ -225,8 +223,6 @@ def markdown(context: ReportContext) -> str:
         values = (value if isinstance(value, str) else number(value) for value in task)
         cells = (str(trial.number), quantity(distance_of(trial), units), *values)
         rows.append(f"| {' | '.join(map(markdown_text, cells))} |")
-    appendix = ((markdown_text(entry.term), entry.standard, entry.content) for entry in repeat.appendix(context))
-    entries = [f"- **{term}** ({standard}): {markdown_text(words, UNCUT)}" for term, standard, words in appendix]
 
     def items(findings: list[Finding]) -> list[str]:
         texts = ((WORDS[each.light], markdown_text(each.name), markdown_text(each.text)) for each in findings)
@@ -238,7 +234,6 @@ def markdown(context: ReportContext) -> str:
         "Insights": items(context.insights),
         "What was not tested": [f"- {markdown_text(sentence)}" for sentence in context.not_tested],
         "Worst tasks": [head, f"|{'---|' * (2 + len(context.task_labels))}", *rows],
-        "For the file": entries,
     }
     blocks = [
         f"# Validation of {markdown_text(context.name) or 'campaign'}",

@@ -184,6 +184,7 @@ def test_nothing_that_a_foreign_store_names_is_imported_or_run(attack: str, fold
     assert [trial.state for trial in Store("a.sqlite").trials()] == ["open"]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_store_of_the_attack_runs_nothing_through_the_real_command_line(folder: Path) -> None:
     store_with(HOSTILE)

@@ -65,6 +65,7 @@ def test_there_are_the_papers_eight_figures() -> None:
         studies_named("framework")
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_study_runs_is_drawn_and_enters_the_table_and_a_second_call_reuses_it(tmp_path: Path) -> None:
     started: list[int] = []

@@ -35,7 +35,7 @@ def test_residuals_are_the_largest_of_each_run() -> None:
 @pytest.mark.parametrize("discarded", [3, *more(0)])
 def test_the_box_leaves_out_more_than_its_volume_as_rarely_as_stated(discarded: int) -> None:
     # r is uniform, so that the share outside of W is 1 - r.
-    wrong, repeats = 0, 200
+    wrong, repeats = 0, 100
     for seed in range(repeats):
         found = disturbance_set(runs(40, seed), model=MODEL, scales=[0.5, 1.0], discarded=discarded, confidence=0.9)
         assert found.volume == volume_bound(40, discarded, 0.1)
