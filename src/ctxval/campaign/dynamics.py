@@ -194,7 +194,8 @@ class CampaignDynamics:
         bound = bound_of(evidence, best, confidence)
         if failed(evidence, bound) is not None:
             further["suspect"] = learned.study.suspected_parameter(learned)
-        if doubt_of(replace(evidence, tests=0), best, bound):  # how many tests a verdict needs is not known here
+        # How many tests a verdict needs is not known here. Rounding is no function that searches and pushes could tell.
+        if evidence.rounding or doubt_of(replace(evidence, tests=0), best, bound):
             return replace(evidence, **further)
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         jump = learned.study.search.largest_jump(drawn_from)
@@ -221,6 +222,8 @@ class CampaignDynamics:
             expected = learned.expected(np.array([predictions[k].point for k in drawn]))
             for k, distance in zip(drawn, np.nan_to_num(expected, nan=1e30, posinf=1e30).tolist(), strict=True):
                 predictions[k] = replace(predictions[k], explained=distance)
+        if learned.rounding:
+            predictions = [replace(each, rounding=learned.rounding) for each in predictions]
         return DynamicsEvidence(
             **vars(worst),
             executions=len(learned.executed),
@@ -237,6 +240,7 @@ class CampaignDynamics:
             physical=learned.study.given.physical,
             without_data=not learned.with_data,
             estimated=learned.study.given.outputs is not None,
+            rounding=learned.rounding,
             **known,
         )
 

@@ -75,7 +75,10 @@ class IntervalSearch:
     @property
     def limit(self) -> float:
         """The value that the bound must not exceed at the end: the threshold, or a little more than was executed."""
-        return (1 + self.within) * self.best if self.threshold is None else self.threshold
+        if self.threshold is not None:
+            return self.threshold
+        learned = self.recorder.dynamics.learned(self.recorder.trials) if self.predicts else None
+        return max((1 + self.within) * self.best, 0.0 if learned is None else learned.rounding)
 
     @property
     def best(self) -> float:

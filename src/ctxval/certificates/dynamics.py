@@ -38,7 +38,7 @@ from ctxval.errors import CertificateError
 # Attributes of the evidence that are numbers of the certificate as well.
 _COPIED = (
     *("noise", "quantile", "lags", "actuator", "physical", "suspect", "without_model", "without_data", "estimated"),
-    *("friction", "sharpness", "jump", "missed", "disagreement"),
+    *("friction", "sharpness", "jump", "missed", "disagreement", "rounding"),
 )
 MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
 
@@ -72,12 +72,12 @@ class Dynamics(CertificateKind):
                 f"{listed(unknown)} failed or gave no distance, so d* is not bounded there; execute the task again, or "
                 f"audit.{advice_to_remeasure(sample)}"
             )
-        if not sample.best > 0:
+        evidence = learned.dynamics(confidence, self.quantile)
+        if not (sample.best > 0 or (evidence is not None and evidence.rounding)):
             raise CertificateError(
                 "all distances are 0, so no prediction of a distance was tested. Check that the distance compares what "
                 f"differs; {AUDIT}."
             )
-        evidence = learned.dynamics(confidence, self.quantile)
         if evidence is None:
             raise CertificateError(
                 "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "

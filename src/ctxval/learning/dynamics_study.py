@@ -26,6 +26,7 @@ from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import STRUCTURES, WITHOUT_LAGS, NoiseStudy
+from ctxval.learning.precision import AgreeingDynamics, agreeing_posterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, schedule, scheduled
 from ctxval.learning.regular import split_transitions
@@ -114,6 +115,9 @@ class DynamicsStudy(ShortRepr):
         extended, logged = self.extended.executions(executed), () if self.extended.needs_tasks else logged
         if extended is None:
             return None
+        agreeing = self._agreeing(extended, logged)
+        if agreeing is not None:
+            return agreeing
         learned = self._learn(extended, logged, with_data=True)
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
             if learned is None or len(executed) < _FEWEST_AGAINST:
@@ -161,6 +165,16 @@ class DynamicsStudy(ShortRepr):
                 return LearnedDynamics(self, parts[0], points, loops, with_data, split, parts[1])
         return None
 
+    def _agreeing(self, executed: Executed, logged: Sequence[Trajectory]) -> AgreeingDynamics | None:
+        """Return M itself, with an error bound, if it explains all executions up to rounding."""
+        recorded = self._recorded(executed, logged, with_data=False) if executed else None
+        if recorded is None:
+            return None
+        model, seed = self.friction or before_refinement(self.validation.model), (self.seed, len(executed), 0)
+        posterior = agreeing_posterior(model, *recorded, seed)
+        points, loops = np.array([point for point, _ in executed]), [loop for _, loop in executed]
+        return None if posterior is None else AgreeingDynamics(self, posterior, points, loops)
+
     def _learn(self, executed: Executed, logged: Sequence[Trajectory], *, with_data: bool) -> LearnedDynamics | None:
         recorded = self._recorded(executed, logged, with_data)
         if recorded is None:
@@ -188,6 +202,8 @@ class DynamicsStudy(ShortRepr):
             return learned.study.as_if_executed(learned, executed, pending, logged)
         together = [*(self.extended.executions(executed) or ()), *pending]
         logged = () if self.extended.needs_tasks else logged
+        if isinstance(learned, AgreeingDynamics):
+            return self._agreeing(together, logged)
         recorded = self._recorded(together, logged, learned.with_data)
         return self._conditioned(learned.posterior.covariances, recorded, together, learned.with_data)
 

@@ -97,6 +97,11 @@ class LearnedDynamics(ShortRepr):
         return tasks
 
     @property
+    def rounding(self) -> float:
+        """The largest distance of any task that is rounding, if M explains all executions up to rounding; 0 if not."""
+        return 0.0
+
+    @property
     def left_out_error(self) -> float:
         """The error of the next states of each execution, predicted from the others, as a share of the error of M."""
         return float(np.sqrt((self.left_out_errors[self.posterior.data.learned] ** 2).mean()))

@@ -20,6 +20,20 @@ from ctxval.models.increments import standard_deviations, standardised_pairs
 from ctxval.models.linear import Linear
 
 NEGLIGIBLE = 1e-7  # a residual below this share of the state's typical change is rounding
+_ROUNDINGS = 16  # rounding errors of a state that may add up in one step
+
+
+def epsilon_of(values: Array) -> float:
+    """Return the relative error of rounding: that of single precision if all values are of single precision."""
+    with np.errstate(over="ignore"):
+        single = np.array_equal(values, values.astype(np.float32))
+    return float(np.finfo(np.float32 if single else np.float64).eps)
+
+
+def floors(states: Array, changes: Array) -> Array:
+    """Return the residuals ``(n,)`` that are rounding, for next states ``(N, n)`` that changed by so much."""
+    rounding = _ROUNDINGS * epsilon_of(states) * np.abs(states).max(axis=0)
+    return np.maximum(NEGLIGIBLE * standard_deviations(changes), rounding)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +63,13 @@ class ResidualData:
         return standardised_pairs(x, u[..., : self.inputs], self.shift, self.scale)
 
 
-def residual_data(model: Model, transitions: Transitions, sources: Rows) -> ResidualData | None:
-    """Return the residuals of a model; None if fewer than two transitions are usable, or if M explains all of them."""
+def residual_data(
+    model: Model, transitions: Transitions, sources: Rows, *, agreeing: bool = False
+) -> ResidualData | None:
+    """Return the residuals of a model; None if fewer than two transitions are usable.
+
+    Returns None also if M explains all of them, unless the data of an ``agreeing`` system are asked for.
+    """
     recorded, moving = np.concatenate([transitions.x, transitions.u], axis=1), np.ones(len(transitions), dtype=np.bool_)
     every = transitions
     if isinstance(model, DryFriction):
@@ -68,8 +87,8 @@ def residual_data(model: Model, transitions: Transitions, sources: Rows) -> Resi
     pairs, residuals = pairs[teach], residuals[teach]
     typical = standard_deviations(steps[teach])
     sizes = np.sqrt((residuals**2).mean(axis=0))
-    learned = sizes > NEGLIGIBLE * typical
-    if not learned.any():
+    learned = sizes > floors(transitions.x_next[teach], steps[teach])
+    if not (learned.any() or agreeing):
         return None
     shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
     return ResidualData(

@@ -1,0 +1,108 @@
+"""Differences between S and M that are rounding: they are bounded, and not learned.
+
+M may be the system itself: a port, a rewrite in another language, a simulator in single precision. Its residual is then
+no function of state and input, and a Gaussian process of it says nothing. So the law of the system is M with an error
+bound, and this module computes what such an error does to distances in closed loop.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval.core.model import Model
+from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.learning.dynamics_posterior import DynamicsPosterior, LearnedCovariances, PosteriorSettings
+from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior
+from ctxval.learning.learned_dynamics import LearnedDynamics
+from ctxval.learning.residual_data import epsilon_of, residual_data
+from ctxval.learning.tolerance import pushed
+from ctxval.learning.worst_case import WorstCase
+
+_MARGIN = 2.0  # multiple of the largest recorded residual, and of executed distances, that counts as rounding
+_AMPLIFIED = 100.0  # largest factor by which executed distances may exceed those under constant errors
+_WAYS = 8  # number of combinations of signs of a constant error of each state
+_TASKS = 256  # number of random tasks under these errors, beside the executed ones
+
+
+@dataclass(frozen=True, eq=False)
+class AgreeingDynamics(LearnedDynamics):
+    """M itself, with an error bound: it explains all executions up to rounding, so there is no residual to learn."""
+
+    @property
+    def left_out_error(self) -> float:
+        """The error of the next states of each execution, predicted from the others: nothing is left to predict."""
+        return 0.0
+
+    @functools.cached_property
+    def _under_errors(self) -> tuple[Array, Array]:
+        """Tasks ``(q, d)`` and their largest distances if M errs in each step by a little more than was recorded."""
+        planner, data = self.study.planner, self.posterior.data
+        x, u, following = data.transitions.x, data.transitions.u, data.transitions.x_next
+        with single_threaded(), np.errstate(all="ignore"):
+            recorded = np.abs(following - self.posterior.covariances.model.step(x, u)).max(axis=0)
+            errors = np.maximum(_MARGIN * recorded, epsilon_of(following) * np.abs(following).max(axis=0))
+            signs = np.random.default_rng(0).choice([-1.0, 1.0], (_WAYS, len(errors)))
+            points = np.concatenate([self.executed, self.study.search.pool[:_TASKS]])
+            planned = planner.plan(points)
+            distances = planner.distances(pushed(self.posterior.mean, signs * errors), planned, len(points))
+        return points, np.nan_to_num(distances, nan=0.0, posinf=np.inf).max(axis=0)
+
+    @functools.cached_property
+    def rounding(self) -> float:
+        """The largest distance of any task that is rounding.
+
+        Errors that follow the motion add up to more than constant ones do, which the executed distances show.
+        """
+        points, distances = self._under_errors
+        executed = np.array([self._distance_of(*each) for each in self.executions])
+        expected = distances[: len(executed)]
+        ratios = np.divide(executed, expected, out=np.zeros(len(executed)), where=expected > 0)
+        return float(distances.max()) * float(np.clip(_MARGIN * ratios.max(initial=0.0), 1.0, _AMPLIFIED))
+
+    def _distance_of(self, point: Array, trajectory: Trajectory) -> float:
+        """Return the distance of an execution; 0 if it is not known."""
+        for plan in self.study.planner.plan(point[None]):
+            shape = plan.promised.states.shape[:-2]
+            states, inputs = (part.reshape(*shape, *part.shape) for part in (trajectory.states, trajectory.inputs))
+            if states.shape == plan.promised.states.shape:
+                distance = self.study.planner.compared(plan, Trajectory(plan.promised.times, states, inputs))
+                return float(np.nan_to_num(distance, posinf=0.0)[0])
+        return 0.0
+
+    def worst_case_of(self, draws: int) -> WorstCase:
+        """Return the largest distance that is rounding, for each of so many draws; no further search can tell more."""
+        points, distances = self._under_errors
+        order = np.argsort(-distances, kind="stable")[: self.study.search.settings.elites]
+        maxima = np.full(self.posterior.functions_for(draws), self.rounding)
+        plans = self.study.search.plans
+        unplanned = 1 - sum(int(np.sum(plan.promised.finite)) for plan in plans) / len(self.study.search.pool)
+        at = np.repeat(points[order[:1]], len(maxima), axis=0)
+        return WorstCase(maxima, at, self.rounding, points[order], _WAYS * len(points), 0.0, unplanned)
+
+    @functools.cached_property
+    def screened(self) -> WorstCase:
+        """The same for a screening."""
+        return self.worst_case_of(1)
+
+    @functools.cached_property
+    def worst_of_mean(self) -> WorstCase:
+        """The same as the only draw."""
+        worst = self.worst_case_of(1)
+        return replace(worst, maxima=worst.maxima[:1], points=worst.points[:1])
+
+
+def agreeing_posterior(
+    model: Model, transitions: Transitions, sources: Rows, seed: tuple[int, ...]
+) -> DynamicsPosterior | None:
+    """Return a posterior of no residual, whose mean and draws are M; None if the residual of a state is no rounding."""
+    data = residual_data(model, transitions, sources, agreeing=True)
+    if data is None or data.learned.any():
+        return None
+    with single_threaded():
+        prior = HyperparameterPosterior.given(data.pairs[:1], data.outputs[:1, :0], data.inputs, FAMILIES[:1])
+    settings = PosteriorSettings(hyperparameters=1, centres=1, pivots=0)
+    return DynamicsPosterior(LearnedCovariances(model, False, data.scale, prior, settings, seed), data)
