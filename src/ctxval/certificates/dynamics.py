@@ -38,7 +38,7 @@ from ctxval.errors import CertificateError
 # Attributes of the evidence that are numbers of the certificate as well.
 _COPIED = (
     *("noise", "quantile", "lags", "actuator", "physical", "suspect", "without_model", "without_data", "estimated"),
-    *("friction", "sharpness", "jump", "missed", "disagreement", "rounding"),
+    *("friction", "sharpness", "jump", "missed", "disagreement", "negligible"),
 )
 MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
 
@@ -73,7 +73,7 @@ class Dynamics(CertificateKind):
                 f"audit.{advice_to_remeasure(sample)}"
             )
         evidence = learned.dynamics(confidence, self.quantile)
-        if not (sample.best > 0 or (evidence is not None and evidence.rounding)):
+        if not (sample.best > 0 or (evidence is not None and evidence.negligible)):
             raise CertificateError(
                 "all distances are 0, so no prediction of a distance was tested. Check that the distance compares what "
                 f"differs; {AUDIT}."
@@ -126,6 +126,8 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
         )
     empty = None if sample.suite is not None else largest_empty_box(sample.points)
     statement = statements.dynamics_statement(upper, error, confidence, evidence.quantile)
+    if evidence.negligible:
+        statement = f"If {statements.SMALL_ERRORS}, d* is at most {upper:.6g}."
     assumptions = statements.dynamics_assumptions(evidence)
     doubt = doubt or diagnostics.doubt_of(evidence, sample.best, bound)
     copied = {name: getattr(evidence, name) for name in _COPIED}

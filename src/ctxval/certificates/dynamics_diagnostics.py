@@ -277,7 +277,7 @@ def unentered_pocket(evidence: DynamicsEvidence) -> str | None:
 
 def untested(evidence: DynamicsEvidence, best: float, bound: float, allowed: float | None = None) -> list[str]:
     """Return why predictions are not tested at large distances; errors may be those of a bound ``allowed``."""
-    if evidence.rounding:
+    if evidence.negligible:
         return []  # no distance is large
     least, reasons = TESTED * evidence.highest, []
     if evidence.quantile is not None:

@@ -110,12 +110,17 @@ class DynamicsStudy(ShortRepr):
         seen = np.setdiff1d(every, self.unseen_parameters)
         return seen if len(seen) else every
 
-    def learn(self, executed: Executed, logged: Sequence[Trajectory] = ()) -> LearnedDynamics | None:
-        """Return what executions, and recordings that belong to no task, teach; None if it is nothing."""
+    def learn(
+        self, executed: Executed, logged: Sequence[Trajectory] = (), allowed: float = 0.0
+    ) -> LearnedDynamics | None:
+        """Return what executions, and recordings that belong to no task, teach; None if it is nothing.
+
+        Errors of M are not learned if they are rounding, or if no distance under them exceeds an ``allowed`` one.
+        """
         extended, logged = self.extended.executions(executed), () if self.extended.needs_tasks else logged
         if extended is None:
             return None
-        agreeing = self._agreeing(extended, logged)
+        agreeing = self._agreeing(extended, logged, executed, allowed)
         if agreeing is not None:
             return agreeing
         learned = self._learn(extended, logged, with_data=True)
@@ -165,15 +170,20 @@ class DynamicsStudy(ShortRepr):
                 return LearnedDynamics(self, parts[0], points, loops, with_data, split, parts[1])
         return None
 
-    def _agreeing(self, executed: Executed, logged: Sequence[Trajectory]) -> AgreeingDynamics | None:
-        """Return M itself, with an error bound, if it explains all executions up to rounding."""
+    def _agreeing(
+        self, executed: Executed, logged: Sequence[Trajectory], recorded_as: Executed, allowed: float
+    ) -> AgreeingDynamics | None:
+        """Return M itself, with an error bound, if it explains all executions up to negligible errors."""
         recorded = self._recorded(executed, logged, with_data=False) if executed else None
         if recorded is None:
             return None
         model, seed = self.friction or before_refinement(self.validation.model), (self.seed, len(executed), 0)
-        posterior = agreeing_posterior(model, *recorded, seed)
         points, loops = np.array([point for point, _ in executed]), [loop for _, loop in executed]
-        return None if posterior is None else AgreeingDynamics(self, posterior, points, loops)
+        posterior = agreeing_posterior(model, *recorded, seed)
+        agreeing = None if posterior is None else AgreeingDynamics(self, posterior, points, loops, allowed=allowed)
+        if agreeing is None or agreeing.is_rounding(recorded_as):
+            return agreeing
+        return agreeing if allowed and agreeing.negligible <= allowed else None
 
     def _learn(self, executed: Executed, logged: Sequence[Trajectory], *, with_data: bool) -> LearnedDynamics | None:
         recorded = self._recorded(executed, logged, with_data)
@@ -203,7 +213,7 @@ class DynamicsStudy(ShortRepr):
         together = [*(self.extended.executions(executed) or ()), *pending]
         logged = () if self.extended.needs_tasks else logged
         if isinstance(learned, AgreeingDynamics):
-            return self._agreeing(together, logged)
+            return self._agreeing(together, logged, executed, learned.allowed)
         recorded = self._recorded(together, logged, learned.with_data)
         return self._conditioned(learned.posterior.covariances, recorded, together, learned.with_data)
 
@@ -237,6 +247,8 @@ class DynamicsStudy(ShortRepr):
         """Return what all executions but one teach, with the same hyperparameters and structure of noise."""
         executed, noisy = learned.executions, learned.noisy
         kept = executed[:k] + executed[k + 1 :]
+        if isinstance(learned, AgreeingDynamics):
+            return self._agreeing(kept, (), kept, learned.allowed)
         recorded = self._recorded(kept, (), learned.with_data)
         others = self._conditioned(learned.posterior.covariances, recorded, kept, learned.with_data)
         if others is None:

@@ -97,8 +97,8 @@ class LearnedDynamics(ShortRepr):
         return tasks
 
     @property
-    def rounding(self) -> float:
-        """The largest distance of any task that is rounding, if M explains all executions up to rounding; 0 if not."""
+    def negligible(self) -> float:
+        """The largest distance of any task under errors that are not learned, if none of M is learned; 0 otherwise."""
         return 0.0
 
     @property

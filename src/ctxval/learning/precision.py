@@ -1,8 +1,8 @@
-"""Differences between S and M that are rounding: they are bounded, and not learned.
+"""Errors of M that are rounding, or that are far too small for the threshold: they are bounded, and not learned.
 
-M may be the system itself: a port, a rewrite in another language, a simulator in single precision. Its residual is then
-no function of state and input, and a Gaussian process of it says nothing. So the law of the system is M with an error
-bound, and this module computes what such an error does to distances in closed loop.
+M may be the system itself: a port, a rewrite in another language, a simulator in single precision or with another
+solver. Its residual is then no function of state and input, and a Gaussian process of it says nothing. So the law of
+the system is M with an error bound, and this module computes what such errors do to distances in closed loop.
 """
 
 from __future__ import annotations
@@ -18,19 +18,29 @@ from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, LearnedCovariances, PosteriorSettings
 from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior
 from ctxval.learning.learned_dynamics import LearnedDynamics
-from ctxval.learning.residual_data import epsilon_of, residual_data
+from ctxval.learning.prediction import Executed
+from ctxval.learning.residual_data import epsilons, floors, residual_data
 from ctxval.learning.tolerance import pushed
 from ctxval.learning.worst_case import WorstCase
 
-_MARGIN = 2.0  # multiple of the largest recorded residual, and of executed distances, that counts as rounding
+SHARE = 0.01  # share of the threshold up to which a distance is negligible
+_MARGIN = 2.0  # multiple of the largest recorded residual, and of executed distances, that an error may have
 _AMPLIFIED = 100.0  # largest factor by which executed distances may exceed those under constant errors
 _WAYS = 8  # number of combinations of signs of a constant error of each state
-_TASKS = 256  # number of random tasks under these errors, beside the executed ones
+_TASKS, _ALONE = 256, 16  # numbers of random tasks under these errors, together and one by one
 
 
 @dataclass(frozen=True, eq=False)
 class AgreeingDynamics(LearnedDynamics):
-    """M itself, with an error bound: it explains all executions up to rounding, so there is no residual to learn."""
+    """M itself, with an error bound: it explains all executions up to negligible errors."""
+
+    allowed: float = 0.0  # the largest distance that is negligible beside the threshold; 0 if only rounding is
+
+    def is_rounding(self, executed: Executed) -> bool:
+        """Return whether errors in executions, as they were recorded, are rounding."""
+        recorded = np.concatenate([trajectory.states[1:] for _, trajectory in executed])
+        data, epsilon = self.posterior.data, float(epsilons(recorded).min())
+        return bool((data.sizes <= floors(data.transitions.x_next, data.steps, epsilon)).all())
 
     @property
     def left_out_error(self) -> float:
@@ -44,20 +54,20 @@ class AgreeingDynamics(LearnedDynamics):
         x, u, following = data.transitions.x, data.transitions.u, data.transitions.x_next
         with single_threaded(), np.errstate(all="ignore"):
             recorded = np.abs(following - self.posterior.covariances.model.step(x, u)).max(axis=0)
-            errors = np.maximum(_MARGIN * recorded, epsilon_of(following) * np.abs(following).max(axis=0))
+            errors = np.maximum(_MARGIN * recorded, epsilons(following) * np.abs(following).max(axis=0))
             signs = np.random.default_rng(0).choice([-1.0, 1.0], (_WAYS, len(errors)))
-            points = np.concatenate([self.executed, self.study.search.pool[:_TASKS]])
+            points = np.concatenate([self.executed, self.study.search.pool[: _TASKS if planner.batched else _ALONE]])
             planned = planner.plan(points)
             distances = planner.distances(pushed(self.posterior.mean, signs * errors), planned, len(points))
         return points, np.nan_to_num(distances, nan=0.0, posinf=np.inf).max(axis=0)
 
     @functools.cached_property
-    def rounding(self) -> float:
-        """The largest distance of any task that is rounding.
+    def negligible(self) -> float:
+        """The largest distance of any task under such errors.
 
         Errors that follow the motion add up to more than constant ones do, which the executed distances show.
         """
-        points, distances = self._under_errors
+        _, distances = self._under_errors
         executed = np.array([self._distance_of(*each) for each in self.executions])
         expected = distances[: len(executed)]
         ratios = np.divide(executed, expected, out=np.zeros(len(executed)), where=expected > 0)
@@ -74,14 +84,14 @@ class AgreeingDynamics(LearnedDynamics):
         return 0.0
 
     def worst_case_of(self, draws: int) -> WorstCase:
-        """Return the largest distance that is rounding, for each of so many draws; no further search can tell more."""
+        """Return the largest distance under negligible errors, for each of so many draws."""
         points, distances = self._under_errors
         order = np.argsort(-distances, kind="stable")[: self.study.search.settings.elites]
-        maxima = np.full(self.posterior.functions_for(draws), self.rounding)
+        maxima = np.full(self.posterior.functions_for(draws), self.negligible)
         plans = self.study.search.plans
         unplanned = 1 - sum(int(np.sum(plan.promised.finite)) for plan in plans) / len(self.study.search.pool)
         at = np.repeat(points[order[:1]], len(maxima), axis=0)
-        return WorstCase(maxima, at, self.rounding, points[order], _WAYS * len(points), 0.0, unplanned)
+        return WorstCase(maxima, at, self.negligible, points[order], _WAYS * len(points), 0.0, unplanned)
 
     @functools.cached_property
     def screened(self) -> WorstCase:
@@ -98,9 +108,9 @@ class AgreeingDynamics(LearnedDynamics):
 def agreeing_posterior(
     model: Model, transitions: Transitions, sources: Rows, seed: tuple[int, ...]
 ) -> DynamicsPosterior | None:
-    """Return a posterior of no residual, whose mean and draws are M; None if the residual of a state is no rounding."""
-    data = residual_data(model, transitions, sources, agreeing=True)
-    if data is None or data.learned.any():
+    """Return a posterior of no residual, whose mean and draws are M; None if too few transitions are usable."""
+    data = residual_data(model, transitions, sources, unlearned=True)
+    if data is None:
         return None
     with single_threaded():
         prior = HyperparameterPosterior.given(data.pairs[:1], data.outputs[:1, :0], data.inputs, FAMILIES[:1])

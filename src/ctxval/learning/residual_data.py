@@ -23,17 +23,20 @@ NEGLIGIBLE = 1e-7  # a residual below this share of the state's typical change i
 _ROUNDINGS = 16  # rounding errors of a state that may add up in one step
 
 
-def epsilon_of(values: Array) -> float:
-    """Return the relative error of rounding: that of single precision if all values are of single precision."""
+def epsilons(values: Array) -> Array:
+    """Return the relative errors of rounding ``(n,)`` of values ``(N, n)``, which may be of single precision."""
     with np.errstate(over="ignore"):
-        single = np.array_equal(values, values.astype(np.float32))
-    return float(np.finfo(np.float32 if single else np.float64).eps)
+        single = (values == values.astype(np.float32)).all(axis=0)
+    return np.asarray(np.where(single, np.finfo(np.float32).eps, np.finfo(np.float64).eps))
 
 
-def floors(states: Array, changes: Array) -> Array:
-    """Return the residuals ``(n,)`` that are rounding, for next states ``(N, n)`` that changed by so much."""
-    rounding = _ROUNDINGS * epsilon_of(states) * np.abs(states).max(axis=0)
-    return np.maximum(NEGLIGIBLE * standard_deviations(changes), rounding)
+def floors(states: Array, changes: Array, epsilon: float = 0.0) -> Array:
+    """Return the residuals ``(n,)`` that are rounding, for next states ``(N, n)`` that changed by so much.
+
+    States that are estimated from outputs are rounded by at least the ``epsilon`` of these.
+    """
+    rounding = _ROUNDINGS * np.maximum(epsilons(states), epsilon) * np.abs(states).max(axis=0)
+    return np.asarray(np.maximum(NEGLIGIBLE * standard_deviations(changes), rounding))
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +67,11 @@ class ResidualData:
 
 
 def residual_data(
-    model: Model, transitions: Transitions, sources: Rows, *, agreeing: bool = False
+    model: Model, transitions: Transitions, sources: Rows, *, unlearned: bool = False
 ) -> ResidualData | None:
-    """Return the residuals of a model; None if fewer than two transitions are usable.
+    """Return the residuals of a model; None if fewer than two transitions are usable, or if M explains all of them.
 
-    Returns None also if M explains all of them, unless the data of an ``agreeing`` system are asked for.
+    With ``unlearned``, no state counts as one with a residual that is not negligible.
     """
     recorded, moving = np.concatenate([transitions.x, transitions.u], axis=1), np.ones(len(transitions), dtype=np.bool_)
     every = transitions
@@ -88,7 +91,9 @@ def residual_data(
     typical = standard_deviations(steps[teach])
     sizes = np.sqrt((residuals**2).mean(axis=0))
     learned = sizes > floors(transitions.x_next[teach], steps[teach])
-    if not (learned.any() or agreeing):
+    if unlearned:
+        learned[:] = False
+    elif not learned.any():
         return None
     shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
     return ResidualData(

@@ -24,7 +24,6 @@ from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.innovations import fit_lagged
 from ctxval.learning.residual_data import floors
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
-from ctxval.models.increments import standard_deviations
 from ctxval.models.parametric import ParametricStep
 from ctxval.studies.causes import CauseReport, Repaired, evidence, find_causes
 from ctxval.studies.fitting import FittedParameter, fit_parameters
