@@ -78,6 +78,8 @@ class DynamicsStudy(ShortRepr):
         self._actuators: dict[bytes, Actuator | None] = {}
         self._actuated: DynamicsStudy | None = None
         self._slowed: dict[bytes, DynamicsStudy | None] = {}
+        #: largest distances of tasks if M errs by so much in each step, of each error and task
+        self.under_errors: dict[bytes, dict[bytes, float]] = {}
 
     def anew(self, quantile: float | None = None) -> DynamicsStudy:
         """Return a study of the same experiment that has learned nothing yet, with a quantile if it is given."""

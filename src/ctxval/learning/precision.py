@@ -15,6 +15,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.learning.closed_loops import Loops
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, LearnedCovariances, PosteriorSettings
 from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior
 from ctxval.learning.learned_dynamics import LearnedDynamics
@@ -24,7 +25,7 @@ from ctxval.learning.tolerance import pushed
 from ctxval.learning.worst_case import WorstCase
 
 SHARE = 0.01  # share of the threshold up to which a distance is negligible
-_MARGIN = 2.0  # multiple of the largest recorded residual, and of executed distances, that an error may have
+_MARGIN = 2.0  # multiple of an executed distance that those of other tasks may have
 _AMPLIFIED = 100.0  # largest factor by which executed distances may exceed those under constant errors
 _WAYS = 8  # number of combinations of signs of a constant error of each state
 _TASKS, _ALONE = 256, 16  # numbers of random tasks under these errors, together and one by one
@@ -49,17 +50,32 @@ class AgreeingDynamics(LearnedDynamics):
 
     @functools.cached_property
     def _under_errors(self) -> tuple[Array, Array]:
-        """Tasks ``(q, d)`` and their largest distances if M errs in each step by a little more than was recorded."""
+        """Tasks ``(q, d)``, the executed ones first, and their largest distances if M errs in each step."""
         planner, data = self.study.planner, self.posterior.data
         x, u, following = data.transitions.x, data.transitions.u, data.transitions.x_next
-        with single_threaded(), np.errstate(all="ignore"):
+        with np.errstate(all="ignore"):
             recorded = np.abs(following - self.posterior.covariances.model.step(x, u)).max(axis=0)
-            errors = np.maximum(_MARGIN * recorded, epsilons(following) * np.abs(following).max(axis=0))
+        least = np.maximum(epsilons(following) * np.abs(following).max(axis=0), 1e-300)
+        # The next power of 2 stays the same after most executions, so that closed loops need not be run again.
+        errors = 2 ** np.ceil(np.log2(np.maximum(recorded, least)))
+        points = np.concatenate([self.executed, self.study.search.pool[: _TASKS if planner.batched else _ALONE]])
+        known = self.study.under_errors.setdefault(errors.tobytes(), {})
+        new = np.array([point for point in points if point.tobytes() not in known])
+        if len(new):
             signs = np.random.default_rng(0).choice([-1.0, 1.0], (_WAYS, len(errors)))
-            points = np.concatenate([self.executed, self.study.search.pool[: _TASKS if planner.batched else _ALONE]])
-            planned = planner.plan(points)
-            distances = planner.distances(pushed(self.posterior.mean, signs * errors), planned, len(points))
-        return points, np.nan_to_num(distances, nan=0.0, posinf=np.inf).max(axis=0)
+            with single_threaded(), np.errstate(all="ignore"):
+                moved = planner.distances(pushed(self.posterior.mean, signs * errors), planner.plan(new), len(new))
+            largest = np.nan_to_num(moved, nan=0.0, posinf=np.inf).max(axis=0)
+            known |= {point.tobytes(): float(distance) for point, distance in zip(new, largest, strict=True)}
+        return points, np.array([known[point.tobytes()] for point in points])
+
+    @functools.cached_property
+    def _pool_loops(self) -> list[Loops]:
+        """The closed loops of the pool's tasks, which those of M are."""
+        promised = [plan.promised for plan in self.study.search.plans]
+        parts = [(run.states, run.inputs) for run in promised]
+        reshaped = [[part.reshape(1, -1, *part.shape[-2:]) for part in each] for each in parts]
+        return [Loops(np.zeros(states.shape[:2]), states, inputs) for states, inputs in reshaped]
 
     @functools.cached_property
     def negligible(self) -> float:

@@ -136,7 +136,8 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
             diagonals = f"{resolution['diagonals']:g} diagonals; usual: {RESOLUTION:g}"
             condition += f"{_gaps(resolution, quantities)} ({diagonals})"
     given = f"if {SMALL_ERRORS}" if details.get("negligible") else f"with {level} {condition}"
-    return f"{untested}every task{quantities.ranges} stays at or below {limit}{which}: the {kind} bound is {upper}, {given}."
+    keeps = f"every task{quantities.ranges} stays at or below {limit}{which}"
+    return f"{untested}{keeps}: the {kind} bound is {upper}, {given}."
 
 
 def _bound_and_limit(certificate: Certificate, tau: float, quantities: Quantities) -> tuple[str, str]:
