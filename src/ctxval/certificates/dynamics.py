@@ -118,7 +118,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
     coverage, worst = evidence.coverage, diagnostics.failed(evidence, bound)
     doubt, differing = statements.both_outcomes(sample, stochastic=False), sample.differing(1e-6 * bound)
     # Two executions of one task must not differ by more than a prediction may be wrong.
-    unlike = diagnostics.ACCURATE * bound
+    unlike = max(diagnostics.ACCURATE * bound, evidence.negligible)
     if doubt is None and evidence.quantile is None and (rows := sample.differing(unlike)) is not None:
         doubt = (
             f"{statements.two_distances(sample, rows)} in the recorded state, or was changed in between, so the bound "

@@ -8,7 +8,7 @@ the system is M with an error bound, and this module computes what such errors d
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -45,7 +45,7 @@ class AgreeingDynamics(LearnedDynamics):
 
     @property
     def left_out_error(self) -> float:
-        """The error of the next states of each execution, predicted from the others: nothing is left to predict."""
+        """The share of the error of M that executions leave to predict: none that matters."""
         return 0.0
 
     @functools.cached_property
@@ -71,11 +71,10 @@ class AgreeingDynamics(LearnedDynamics):
 
     @functools.cached_property
     def _pool_loops(self) -> list[Loops]:
-        """The closed loops of the pool's tasks, which those of M are."""
-        promised = [plan.promised for plan in self.study.search.plans]
-        parts = [(run.states, run.inputs) for run in promised]
-        reshaped = [[part.reshape(1, -1, *part.shape[-2:]) for part in each] for each in parts]
-        return [Loops(np.zeros(states.shape[:2]), states, inputs) for states, inputs in reshaped]
+        """The closed loops of M on the pool's tasks, which are planned already."""
+        promised = [(plan.promised.states, plan.promised.inputs) for plan in self.study.search.plans]
+        loops = [[part.reshape(1, -1, *part.shape[-2:]) for part in parts] for parts in promised]
+        return [Loops(np.zeros(states.shape[:2]), states, inputs) for states, inputs in loops]
 
     @functools.cached_property
     def negligible(self) -> float:
@@ -92,10 +91,13 @@ class AgreeingDynamics(LearnedDynamics):
     def _distance_of(self, point: Array, trajectory: Trajectory) -> float:
         """Return the distance of an execution; 0 if it is not known."""
         for plan in self.study.planner.plan(point[None]):
-            shape = plan.promised.states.shape[:-2]
-            states, inputs = (part.reshape(*shape, *part.shape) for part in (trajectory.states, trajectory.inputs))
-            if states.shape == plan.promised.states.shape:
-                distance = self.study.planner.compared(plan, Trajectory(plan.promised.times, states, inputs))
+            model = plan.promised
+            if model.states.size == trajectory.states.size:
+                shapes = model.states.shape, model.inputs.shape
+                states, inputs = (
+                    x.reshape(s) for x, s in zip((trajectory.states, trajectory.inputs), shapes, strict=True)
+                )
+                distance = self.study.planner.compared(plan, Trajectory(model.times, states, inputs))
                 return float(np.nan_to_num(distance, posinf=0.0)[0])
         return 0.0
 
@@ -110,15 +112,14 @@ class AgreeingDynamics(LearnedDynamics):
         return WorstCase(maxima, at, self.negligible, points[order], _WAYS * len(points), 0.0, unplanned)
 
     @functools.cached_property
-    def screened(self) -> WorstCase:
-        """The same for a screening."""
+    def worst_of_mean(self) -> WorstCase:
+        """The largest distance under negligible errors."""
         return self.worst_case_of(1)
 
-    @functools.cached_property
-    def worst_of_mean(self) -> WorstCase:
-        """The same as the only draw."""
-        worst = self.worst_case_of(1)
-        return replace(worst, maxima=worst.maxima[:1], points=worst.points[:1])
+    @property
+    def screened(self) -> WorstCase:
+        """The largest distance under negligible errors."""
+        return self.worst_of_mean
 
 
 def agreeing_posterior(
