@@ -176,12 +176,14 @@ class DynamicsStudy(ShortRepr):
         self, executed: Executed, logged: Sequence[Trajectory], recorded_as: Executed, allowed: float
     ) -> AgreeingDynamics | None:
         """Return M itself, with an error bound, if it explains all executions up to negligible errors."""
-        recorded = self._recorded(executed, logged, with_data=False) if executed else None
+        if not executed or self.friction is not None or self.actuator is not None:
+            return None  # M alone does not explain them
+        recorded = self._recorded(executed, logged, with_data=False)
         if recorded is None:
             return None
-        model, seed = self.friction or before_refinement(self.validation.model), (self.seed, len(executed), 0)
         points, loops = np.array([point for point, _ in executed]), [loop for _, loop in executed]
-        posterior = agreeing_posterior(model, *recorded, seed)
+        seed = self.seed, len(executed), 0
+        posterior = agreeing_posterior(before_refinement(self.validation.model), *recorded, seed)
         agreeing = None if posterior is None else AgreeingDynamics(self, posterior, points, loops, allowed=allowed)
         if agreeing is None or agreeing.is_rounding(recorded_as):
             return agreeing

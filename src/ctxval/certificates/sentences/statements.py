@@ -192,7 +192,7 @@ def dynamics_statement(upper: float, error: float, confidence: float, quantile: 
     return f"{bound}, d* is at most {with_error(upper, error)}."
 
 
-SMALL_ERRORS = "M errs nowhere by more than twice its largest error in a recorded step"
+SMALL_ERRORS = "M errs nowhere by more than its largest error in a recorded step"
 """The assumption if the errors of M are negligible in all executions."""
 
 _WITHOUT_DATA = (
