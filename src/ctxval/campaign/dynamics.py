@@ -28,6 +28,7 @@ from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.coverage import untried_corner
+from ctxval.learning.precision import SHARE
 from ctxval.learning.prediction import Executed
 from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
@@ -84,17 +85,23 @@ class CampaignDynamics:
             self._use(self.study.anew())
         # The other recordings are kept with what they taught, so that their identities stay theirs. A result may be
         # replaced, and then has another distance.
-        key = (*((trial.number, trial.distance) for trial, _ in executed), *map(id, others))
+        allowed = self._allowed(trials)
+        key = (allowed, *((trial.number, trial.distance) for trial, _ in executed), *map(id, others))
         if key not in self._learned:
             learned, failure = None, None
             try:
                 self._parts = self._parts or self.study.state_of_parts()
-                learned = self.study.learn(at_points(executed), others)
+                learned = self.study.learn(at_points(executed), others, allowed)
             except Exception as error:  # users' parts
                 failure = reason_of(error)
             self._learned[key] = others, learned, failure
         _, learned, self.failure = self._learned[key]
         return learned
+
+    def _allowed(self, trials: Sequence[Trial]) -> float:
+        """Return the distance that is negligible beside all stated thresholds; 0 if executed ones are larger."""
+        least = min((stated.threshold for stated in self._store.thresholds() or ()), default=0.0)
+        return SHARE * least if Trials(trials).largest <= SHARE * least else 0.0
 
     def regular(self, trials: Sequence[Trial]) -> LearnedDynamics | None:
         """Return what the regular transitions of the completed trials teach; None if there are no irregular ones."""
@@ -182,7 +189,9 @@ class CampaignDynamics:
         return DynamicsEvidence.from_json(self._store.computed(self._key(trials, confidence)))
 
     def _key(self, trials: Sequence[Trial], confidence: float) -> str:
-        text = json.dumps([(trial.number, trial.state, trial.distance, trial.note) for trial in trials])
+        text = json.dumps(
+            [self._allowed(trials), *((trial.number, trial.state, trial.distance, trial.note) for trial in trials)]
+        )
         physical = "".join(f"{name} " for name in self.study.given.physical)
         return f"evidence {confidence} {self.study.quantile} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
@@ -198,9 +207,8 @@ class CampaignDynamics:
         further |= {"drift": learned.drift, "uneven": learned.uneven_friction}
         if failed(evidence, bound) is not None:
             further["suspect"] = learned.study.suspected_parameter(learned)
-        if doubt_of(
-            replace(evidence, tests=0, **further), best, bound
-        ):  # how many tests a verdict needs is not known here
+        # How many tests a verdict needs is not known here. Negligible errors are no function to search, nor to push.
+        if evidence.negligible or doubt_of(replace(evidence, tests=0, **further), best, bound):
             return replace(evidence, **further)
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         jump = learned.study.search.largest_jump(drawn_from)
@@ -244,6 +252,8 @@ class CampaignDynamics:
             expected = learned.expected(np.array([predictions[k].point for k in drawn]))
             for k, distance in zip(drawn, np.nan_to_num(expected, nan=1e30, posinf=1e30).tolist(), strict=True):
                 predictions[k] = replace(predictions[k], explained=distance)
+        if learned.negligible:
+            predictions = [replace(each, negligible=learned.negligible) for each in predictions]
         return DynamicsEvidence(
             **vars(worst),
             executions=len(learned.executed),
@@ -260,6 +270,7 @@ class CampaignDynamics:
             physical=learned.study.given.physical,
             without_data=not learned.with_data,
             estimated=learned.study.given.outputs is not None,
+            negligible=learned.negligible,
             **known,
         )
 

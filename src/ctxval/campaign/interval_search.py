@@ -79,7 +79,10 @@ class IntervalSearch:
     @property
     def limit(self) -> float:
         """The value that the bound must not exceed at the end: the threshold, or a little more than was executed."""
-        return (1 + self.within) * self.best if self.threshold is None else self.threshold
+        if self.threshold is not None:
+            return self.threshold
+        learned = self.recorder.dynamics.learned(self.recorder.trials) if self.predicts else None
+        return (1 + self.within) * max(self.best, 0.0 if learned is None else learned.negligible)
 
     @property
     def best(self) -> float:
@@ -272,7 +275,8 @@ class IntervalSearch:
             patient = chosen < 16 or lacks_tests or unentered_pocket(evidence) is not None
             if not patient:
                 return self._by_distance()
-            if covering(self._points(trials), kind.resolution, 0) is not None and self._by_distance() is None:
+            covers = not evidence.negligible and covering(self._points(trials), kind.resolution, 0) is not None
+            if covers and self._by_distance() is None:
                 return None
         return self.test() if lacks_tests else self._by_evidence(evidence)
 

@@ -39,7 +39,7 @@ from ctxval.errors import CertificateError
 # Attributes of the evidence that are numbers of the certificate as well.
 _COPIED = (
     *("noise", "quantile", "lags", "actuator", "physical", "suspect", "without_model", "without_data", "estimated"),
-    *("friction", "sharpness", "jump", "missed", "disagreement"),
+    *("friction", "sharpness", "jump", "missed", "disagreement", "negligible"),
 )
 MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
 
@@ -73,12 +73,12 @@ class Dynamics(CertificateKind):
                 f"{listed(unknown)} failed or gave no distance, so d* is not bounded there; execute the task again, or "
                 f"audit.{advice_to_remeasure(sample)}"
             )
-        if not sample.best > 0:
+        evidence = learned.dynamics(confidence, self.quantile)
+        if not (sample.best > 0 or (evidence is not None and evidence.negligible)):
             raise CertificateError(
                 "all distances are 0, so no prediction of a distance was tested. Check that the distance compares what "
                 f"differs; {AUDIT}."
             )
-        evidence = learned.dynamics(confidence, self.quantile)
         if evidence is None:
             raise CertificateError(
                 "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "
@@ -119,7 +119,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
     coverage, worst = evidence.coverage, diagnostics.failed(evidence, bound)
     doubt, differing = statements.both_outcomes(sample, stochastic=False), sample.differing(1e-6 * bound)
     # Two executions of one task must not differ by more than a prediction may be wrong.
-    unlike = diagnostics.ACCURATE * bound
+    unlike = max(diagnostics.ACCURATE * bound, evidence.negligible)
     if doubt is None and evidence.quantile is None and (rows := sample.differing(unlike)) is not None:
         doubt = (
             f"{statements.two_distances(sample, rows)} in the recorded state, or was changed in between, so the bound "
@@ -127,6 +127,8 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
         )
     empty = None if sample.suite is not None else largest_empty_box(sample.points)
     statement = statements.dynamics_statement(upper, error, confidence, evidence.quantile)
+    if evidence.negligible:
+        statement = f"If {statements.SMALL_ERRORS}, d* is at most {upper:.6g}."
     assumptions = statements.dynamics_assumptions(evidence)
     doubt = doubt or diagnostics.doubt_of(evidence, sample.best, bound)
     level = upper if sample.threshold is None else sample.threshold

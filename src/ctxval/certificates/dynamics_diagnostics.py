@@ -76,7 +76,7 @@ def held(prediction: CheckedPrediction, bound: float) -> bool:
     """Return whether an execution agrees with its prediction; with noise, whether it is not improbably large."""
     if prediction.is_noisy:
         return prediction.chance_of_more(prediction.distance - TOLERATED * bound) >= UNLIKELY
-    return agrees(prediction.distance, prediction.median, bound)
+    return prediction.error <= ACCURATE * bound
 
 
 def mostly_fail(holding: Sequence[bool]) -> bool:
@@ -335,6 +335,8 @@ def unentered_pocket(evidence: DynamicsEvidence) -> str | None:
 
 def untested(evidence: DynamicsEvidence, best: float, bound: float, allowed: float | None = None) -> list[str]:
     """Return why predictions are not tested at large distances; errors may be those of a bound ``allowed``."""
+    if evidence.negligible:
+        return []  # no distance is large
     least, reasons = TESTED * evidence.highest, []
     if evidence.quantile is not None:
         least = NOISY_TESTED * min(evidence.highest, float(np.median(evidence.maxima)))

@@ -38,6 +38,7 @@ class CheckedPrediction(ShortRepr):
     runs: int = 0  #: the number of predicted distances that these are of
     p_values: tuple[float, ...] = ()  #: chances of more than statistics of the trajectory; empty without noise
     explained: float | None = None  #: the distance of the task on what all executions teach; None if it is not known
+    negligible: float = 0.0  #: the largest difference from the prediction by errors of M that are not learned
 
     @property
     def is_noisy(self) -> bool:
@@ -53,12 +54,12 @@ class CheckedPrediction(ShortRepr):
         """How far the distance exceeds the median, or the 0.9 quantile with noise; infinity without a prediction."""
         if self.is_noisy:
             return max(self.distance - float(np.interp(0.9, LEVELS, self.quantiles)), 0.0)
-        return max(self.distance - self.median, 0.0) if np.isfinite(self.median) else np.inf
+        return max(self.distance - self.median - self.negligible, 0.0) if np.isfinite(self.median) else np.inf
 
     @property
     def error(self) -> float:
-        """The difference between the distance and the prediction's median; infinity if nothing was predicted."""
-        return abs(self.distance - self.median) if np.isfinite(self.median) else np.inf
+        """The difference between distance and median that is not negligible; infinity if nothing was predicted."""
+        return max(abs(self.distance - self.median) - self.negligible, 0.0) if np.isfinite(self.median) else np.inf
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes but the quantiles, ready for JSON: numbers that are not finite are None."""
@@ -112,6 +113,8 @@ class DynamicsEvidence(ShortRepr):
     drift: tuple[str, float] | None = None  #: with what effects of executions change, and its p-value; None without any
     #: of friction at rest, by how many times a force that a joint withstood exceeds one that moved it elsewhere
     uneven: float = 1.0
+    #: the largest distance under errors of M as small as all that were recorded; 0 if such errors are learned
+    negligible: float = 0.0
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""

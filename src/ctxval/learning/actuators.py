@@ -19,7 +19,7 @@ from ctxval.core.model import Model
 from ctxval.core.task import Task
 from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior, Mode, learning_rows, log_posterior
-from ctxval.learning.residual_data import NEGLIGIBLE
+from ctxval.learning.residual_data import floors
 from ctxval.models.increments import standard_deviations
 
 _LONGEST = 6.0  # steps, of a delay and of a time constant
@@ -88,7 +88,7 @@ def found_actuator(
     Z, E, _ = history.along(records)
     steps = np.concatenate([np.diff(each.states, axis=0) for each in records])
     sizes = np.sqrt((E**2).mean(axis=0))
-    live = sizes > NEGLIGIBLE * standard_deviations(steps)
+    live = sizes > floors(np.concatenate([each.states[1:] for each in records]), steps)
     if not live.any():
         return None
     inputs = records[0].inputs.shape[-1]

@@ -121,6 +121,8 @@ class DynamicsDraws(DrawsWithoutNoise):
 
     def residuals(self, x: Array, u: Array) -> Array:
         """Return the residuals ``(S, q, n)`` at states ``(S, q, n)`` and acting inputs ``(S, q, m)``."""
+        if not self.data.learned.any():
+            return np.zeros_like(x)
         z = bounded(self.data.standardised(x, u))
         parts = np.split(z, np.cumsum([len(each.weights) for each in self.expansions[:-1]], dtype=int))
         learned = np.concatenate([each(part) for each, part in zip(self.expansions, parts, strict=True)])

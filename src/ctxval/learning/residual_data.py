@@ -20,6 +20,23 @@ from ctxval.models.increments import standard_deviations, standardised_pairs
 from ctxval.models.linear import Linear
 
 NEGLIGIBLE = 1e-7  # a residual below this share of the state's typical change is rounding
+_ROUNDINGS = 16  # rounding errors of a state that may add up in one step
+
+
+def epsilons(values: Array) -> Array:
+    """Return the relative errors of rounding ``(n,)`` of values ``(N, n)``, which may be of single precision."""
+    with np.errstate(over="ignore"):
+        single = (values == values.astype(np.float32)).all(axis=0)
+    return np.asarray(np.where(single, np.finfo(np.float32).eps, np.finfo(np.float64).eps))
+
+
+def floors(states: Array, changes: Array, epsilon: float = 0.0) -> Array:
+    """Return the residuals ``(n,)`` that are rounding, for next states ``(N, n)`` that changed by so much.
+
+    States that are estimated from outputs are rounded by at least the ``epsilon`` of these.
+    """
+    rounding = _ROUNDINGS * np.maximum(epsilons(states), epsilon) * np.abs(states).max(axis=0)
+    return np.asarray(np.maximum(NEGLIGIBLE * standard_deviations(changes), rounding))
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +66,13 @@ class ResidualData:
         return standardised_pairs(x, u[..., : self.inputs], self.shift, self.scale)
 
 
-def residual_data(model: Model, transitions: Transitions, sources: Rows) -> ResidualData | None:
-    """Return the residuals of a model; None if fewer than two transitions are usable, or if M explains all of them."""
+def residual_data(
+    model: Model, transitions: Transitions, sources: Rows, *, unlearned: bool = False
+) -> ResidualData | None:
+    """Return the residuals of a model; None if fewer than two transitions are usable, or if M explains all of them.
+
+    With ``unlearned``, no state counts as one with a residual that is not negligible.
+    """
     recorded, moving = np.concatenate([transitions.x, transitions.u], axis=1), np.ones(len(transitions), dtype=np.bool_)
     every = transitions
     if isinstance(model, DryFriction):
@@ -68,8 +90,10 @@ def residual_data(model: Model, transitions: Transitions, sources: Rows) -> Resi
     pairs, residuals = pairs[teach], residuals[teach]
     typical = standard_deviations(steps[teach])
     sizes = np.sqrt((residuals**2).mean(axis=0))
-    learned = sizes > NEGLIGIBLE * typical
-    if not learned.any():
+    learned = sizes > floors(transitions.x_next[teach], steps[teach])
+    if unlearned:
+        learned[:] = False
+    elif not learned.any():
         return None
     shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
     return ResidualData(

@@ -192,6 +192,9 @@ def dynamics_statement(upper: float, error: float, confidence: float, quantile: 
     return f"{bound}, d* is at most {with_error(upper, error)}."
 
 
+SMALL_ERRORS = "M errs nowhere by more than its largest error in a recorded step"
+"""The assumption if the errors of M are negligible in all executions."""
+
 _WITHOUT_DATA = (
     "the data that M was made from contradict the executions and are left out: M was learned on another system, or the "
     "system has changed since",
@@ -231,6 +234,10 @@ def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
             f"time or with the task{but}"
         )
     acting, friction = late(evidence.actuator), rubbing(evidence.friction)
+    if evidence.negligible:
+        gaps = with_units(evidence.coverage.resolution)
+        beside = f"the largest gaps of the records of states and inputs, where this is not known, are {gaps}"
+        return complete, alike, SMALL_ERRORS, beside, joint, ANY_ORDER
     return (
         complete,
         *([f"inputs act alike in every task: {acting.removeprefix('acting ')}"] if acting else []),

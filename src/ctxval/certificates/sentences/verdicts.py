@@ -24,7 +24,7 @@ from ctxval.certificates.bounds import (
 )
 from ctxval.certificates.covering import RESOLUTION, EmptyBox
 from ctxval.certificates.sample import executions_of
-from ctxval.certificates.sentences.statements import condition_on_dynamics, conditions_on_dynamics
+from ctxval.certificates.sentences.statements import SMALL_ERRORS, condition_on_dynamics, conditions_on_dynamics
 from ctxval.certificates.sentences.withdrawals import REFINED
 from ctxval.core.learned_numbers import PushedDistances, Tolerance
 from ctxval.core.space import TaskSpace
@@ -135,10 +135,9 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
         if resolution is not None and resolution["diagonals"] != RESOLUTION:
             diagonals = f"{resolution['diagonals']:g} diagonals; usual: {RESOLUTION:g}"
             condition += f"{_gaps(resolution, quantities)} ({diagonals})"
-    return (
-        f"{untested}every task{quantities.ranges} stays at or below {limit}{which}: the {kind} bound is {upper}, with "
-        f"{level} {condition}."
-    )
+    given = f"if {SMALL_ERRORS}" if details.get("negligible") else f"with {level} {condition}"
+    keeps = f"every task{quantities.ranges} stays at or below {limit}{which}"
+    return f"{untested}{keeps}: the {kind} bound is {upper}, {given}."
 
 
 def _bound_and_limit(certificate: Certificate, tau: float, quantities: Quantities) -> tuple[str, str]:

@@ -22,9 +22,8 @@ from ctxval.errors import CtxvalError, InputError, ModelError, UnknownNameError
 from ctxval.learning import PosteriorSettings, learn_posterior
 from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.innovations import fit_lagged
-from ctxval.learning.residual_data import NEGLIGIBLE
+from ctxval.learning.residual_data import floors
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
-from ctxval.models.increments import standard_deviations
 from ctxval.models.parametric import ParametricStep
 from ctxval.studies.causes import CauseReport, Repaired, evidence, find_causes
 from ctxval.studies.fitting import FittedParameter, fit_parameters
@@ -267,7 +266,7 @@ def averaged_correction(model: Model, records: Records) -> Correction | None:
     # Numbers may not be finite.
     with suppress(np.linalg.LinAlgError, ValueError), single_threaded(), np.errstate(all="ignore"):
         sizes = np.sqrt(((data.x_next - model.step(data.x, data.u)) ** 2).mean(axis=0))
-        live = sizes > NEGLIGIBLE * standard_deviations(data.x_next - data.x)
+        live = sizes > floors(data.x_next, data.x_next - data.x)
         if live.any():
             history = History(model, Structure(), np.eye(len(live)))
             fit = fit_lagged(history, runs, np.zeros((0, k)), None, live, products=False)

@@ -1,0 +1,135 @@
+"""Errors of M that are rounding, or that are far too small for the threshold: they are bounded, and not learned.
+
+M may be the system itself: a port, a rewrite in another language, a simulator in single precision or with another
+solver. Its residual is then no function of state and input, and a Gaussian process of it says nothing. So the law of
+the system is M with an error bound, and this module computes what such errors do to distances in closed loop.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval.core.model import Model
+from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.learning.closed_loops import Loops
+from ctxval.learning.dynamics_posterior import DynamicsPosterior, LearnedCovariances, PosteriorSettings
+from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior
+from ctxval.learning.learned_dynamics import LearnedDynamics
+from ctxval.learning.prediction import Executed
+from ctxval.learning.residual_data import epsilons, floors, residual_data
+from ctxval.learning.tolerance import pushed
+from ctxval.learning.worst_case import WorstCase
+
+SHARE = 0.01  # share of the threshold up to which a distance is negligible
+_MARGIN = 2.0  # multiple of an executed distance that those of other tasks may have
+_AMPLIFIED = 100.0  # largest factor by which executed distances may exceed those under constant errors
+_WAYS = 8  # number of combinations of signs of a constant error of each state
+_TASKS, _ALONE = 256, 16  # numbers of random tasks under these errors, together and one by one
+
+
+@dataclass(frozen=True, eq=False)
+class AgreeingDynamics(LearnedDynamics):
+    """M itself, with an error bound: it explains all executions up to negligible errors."""
+
+    allowed: float = 0.0  # the largest distance that is negligible beside the threshold; 0 if only rounding is
+
+    def is_rounding(self, executed: Executed) -> bool:
+        """Return whether errors in executions, as they were recorded, are rounding."""
+        recorded = np.concatenate([trajectory.states[1:] for _, trajectory in executed])
+        data, epsilon = self.posterior.data, float(epsilons(recorded).min())
+        return bool((data.sizes <= floors(data.transitions.x_next, data.steps, epsilon)).all())
+
+    @property
+    def left_out_error(self) -> float:
+        """The share of the error of M that executions leave to predict: none that matters."""
+        return 0.0
+
+    @functools.cached_property
+    def _under_errors(self) -> tuple[Array, Array]:
+        """Tasks ``(q, d)``, the executed ones first, and their largest distances if M errs in each step."""
+        planner, data = self.study.planner, self.posterior.data
+        x, u, following = data.transitions.x, data.transitions.u, data.transitions.x_next
+        with np.errstate(all="ignore"):
+            recorded = np.abs(following - self.posterior.covariances.model.step(x, u)).max(axis=0)
+        least = np.maximum(epsilons(following) * np.abs(following).max(axis=0), 1e-300)
+        # The next power of 2 stays the same after most executions, so that closed loops need not be run again.
+        errors = 2 ** np.ceil(np.log2(np.maximum(recorded, least)))
+        points = np.concatenate([self.executed, self.study.search.pool[: _TASKS if planner.batched else _ALONE]])
+        known = self.study.under_errors.setdefault(errors.tobytes(), {})
+        new = np.array([point for point in points if point.tobytes() not in known])
+        if len(new):
+            signs = np.random.default_rng(0).choice([-1.0, 1.0], (_WAYS, len(errors)))
+            with single_threaded(), np.errstate(all="ignore"):
+                moved = planner.distances(pushed(self.posterior.mean, signs * errors), planner.plan(new), len(new))
+            largest = np.nan_to_num(moved, nan=0.0, posinf=np.inf).max(axis=0)
+            known |= {point.tobytes(): float(distance) for point, distance in zip(new, largest, strict=True)}
+        return points, np.array([known[point.tobytes()] for point in points])
+
+    @functools.cached_property
+    def _pool_loops(self) -> list[Loops]:
+        """The closed loops of M on the pool's tasks, which are planned already."""
+        promised = [(plan.promised.states, plan.promised.inputs) for plan in self.study.search.plans]
+        loops = [[part.reshape(1, -1, *part.shape[-2:]) for part in parts] for parts in promised]
+        return [Loops(np.zeros(states.shape[:2]), states, inputs) for states, inputs in loops]
+
+    @functools.cached_property
+    def negligible(self) -> float:
+        """The largest distance of any task under such errors.
+
+        Errors that follow the motion add up to more than constant ones do, which the executed distances show.
+        """
+        _, distances = self._under_errors
+        executed = np.array([self._distance_of(*each) for each in self.executions])
+        expected = distances[: len(executed)]
+        ratios = np.divide(executed, expected, out=np.zeros(len(executed)), where=expected > 0)
+        return float(distances.max()) * float(np.clip(_MARGIN * ratios.max(initial=0.0), 1.0, _AMPLIFIED))
+
+    def _distance_of(self, point: Array, trajectory: Trajectory) -> float:
+        """Return the distance of an execution; 0 if it is not known."""
+        for plan in self.study.planner.plan(point[None]):
+            model = plan.promised
+            if model.states.size == trajectory.states.size:
+                shapes = model.states.shape, model.inputs.shape
+                states, inputs = (
+                    x.reshape(s) for x, s in zip((trajectory.states, trajectory.inputs), shapes, strict=True)
+                )
+                distance = self.study.planner.compared(plan, Trajectory(model.times, states, inputs))
+                return float(np.nan_to_num(distance, posinf=0.0)[0])
+        return 0.0
+
+    def worst_case_of(self, draws: int) -> WorstCase:
+        """Return the largest distance under negligible errors, for each of so many draws."""
+        points, distances = self._under_errors
+        order = np.argsort(-distances, kind="stable")[: self.study.search.settings.elites]
+        maxima = np.full(self.posterior.functions_for(draws), self.negligible)
+        plans = self.study.search.plans
+        unplanned = 1 - sum(int(np.sum(plan.promised.finite)) for plan in plans) / len(self.study.search.pool)
+        at = np.repeat(points[order[:1]], len(maxima), axis=0)
+        return WorstCase(maxima, at, self.negligible, points[order], _WAYS * len(points), 0.0, unplanned)
+
+    @functools.cached_property
+    def worst_of_mean(self) -> WorstCase:
+        """The largest distance under negligible errors."""
+        return self.worst_case_of(1)
+
+    @property
+    def screened(self) -> WorstCase:
+        """The largest distance under negligible errors."""
+        return self.worst_of_mean
+
+
+def agreeing_posterior(
+    model: Model, transitions: Transitions, sources: Rows, seed: tuple[int, ...]
+) -> DynamicsPosterior | None:
+    """Return a posterior of no residual, whose mean and draws are M; None if too few transitions are usable."""
+    data = residual_data(model, transitions, sources, unlearned=True)
+    if data is None:
+        return None
+    with single_threaded():
+        prior = HyperparameterPosterior.given(data.pairs[:1], data.outputs[:1, :0], data.inputs, FAMILIES[:1])
+    settings = PosteriorSettings(hyperparameters=1, centres=1, pivots=0)
+    return DynamicsPosterior(LearnedCovariances(model, False, data.scale, prior, settings, seed), data)
