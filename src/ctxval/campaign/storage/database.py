@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sqlite3
 import time
 import warnings
@@ -149,6 +150,13 @@ class Database:
 
     def _damaged(self, what: str) -> ForeignStoreError:
         return ForeignStoreError(f"{self.name} is damaged: {what}; `ctxval export` saves what is readable.")
+
+    def _unreadable(self, number: int, what: str) -> ForeignStoreError:
+        store = shlex.quote(self.name)
+        advice = f"`ctxval status {store} --set-aside {number}` sets this trial aside, so that the others are usable"
+        return ForeignStoreError(
+            f"{self.name} is damaged: {what}; {advice}, and `ctxval export` saves what is readable."
+        )
 
 
 def _acquire(lock: FileLock, wait: float) -> None:
