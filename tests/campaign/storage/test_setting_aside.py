@@ -53,6 +53,12 @@ def damage(path: Path, statement: str, *values: Any) -> None:
         connection.execute(statement, values)
 
 
+def stored_row(path: Path) -> Any:
+    with closing(sqlite3.connect(path)) as connection:
+        connection.text_factory = lambda text: text.decode("utf-8", "backslashreplace")
+        return connection.execute(f"SELECT {COLUMNS}, checksum FROM trials WHERE number = 1").fetchone()
+
+
 DAMAGES = {
     "distance": "UPDATE trials SET distance = distance + 1 WHERE number = 1",
     "null distance": "UPDATE trials SET distance = NULL WHERE number = 1",
@@ -71,7 +77,7 @@ def test_a_damaged_trial_is_measured_again_and_nothing_is_deleted(tmp_path: Path
     path = tmp_path / "a.sqlite"
     before = executed(path, kind)
     damage(path, DAMAGES[name])
-    row, _ = Store(path).raw(1)
+    row = stored_row(path)
     with pytest.raises(ForeignStoreError, match="--set-aside 1"):
         Store(path).trials()
     result = CliRunner().invoke(app, ["status", str(path), "--set-aside", "1", "--json"])
@@ -126,7 +132,7 @@ def test_a_readable_or_missing_trial_is_not_set_aside(tmp_path: Path, number: in
 def test_a_row_of_another_version_with_minus_zero_is_measured_again(tmp_path: Path) -> None:
     path = tmp_path / "a.sqlite"
     executed(path)
-    (*row, _), _ = Store(path).raw(1)
+    *row, _ = stored_row(path)
     row[COLUMNS.split(", ").index("distance")] = -0.0
     damage(path, "UPDATE trials SET distance = -0.0, checksum = ? WHERE number = 1", checksum_of(tuple(row)))
     with pytest.raises(ForeignStoreError):

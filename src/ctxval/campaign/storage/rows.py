@@ -31,7 +31,12 @@ def row_of(trial: Trial) -> tuple[Any, ...]:
         distance, seconds = (None if value is None else float(value) + 0.0 for value in (trial.distance, trial.seconds))
         failure, because = (None if text is None else text_of(text) for text in (trial.failure, trial.because))
         row = (
-            *(int(index(trial.number)), str(trial.origin), str(trial.state), as_json(as_floats("unit_point", trial.unit_point))),
+            *(
+                int(index(trial.number)),
+                str(trial.origin),
+                str(trial.state),
+                as_json(as_floats("unit_point", trial.unit_point)),
+            ),
             *(as_json(trial.parameters), int(index(trial.attempts)), int(trial.executed)),
             *(distance, failure, seconds, as_json(trial.note), because),
         )

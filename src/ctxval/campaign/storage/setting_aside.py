@@ -10,13 +10,13 @@ from typing import Any, get_args
 import numpy as np
 
 from ctxval._util.arrays import Array, as_finite
-from ctxval.campaign.storage.rows import COLUMNS, read_json, read_trajectory, read_trial
+from ctxval.campaign.storage.rows import COLUMNS, checksum_of, read_json, read_trajectory, read_trial, row_of
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates import Provenance
 from ctxval.core.space import TaskSpace
 from ctxval.core.trajectory import COMPLETE
-from ctxval.core.trial import Change, Origin, Trial
-from ctxval.errors import CtxvalError, InputError
+from ctxval.core.trial import Change, Origin, State, Trial
+from ctxval.errors import InputError
 
 SET_ASIDE = "set aside"  #: kind of a change in the history
 
@@ -32,22 +32,34 @@ def set_aside(store: Store, number: int) -> str:
         InputError: if there is no such trial, if it can be read, or if the task space cannot.
     """
     with store.sole_writer():
-        row, trajectories = store.raw(number)
+        with store.snapshot():
+            row = store._execute(f"SELECT {COLUMNS}, checksum FROM trials WHERE number = ?", (number,)).fetchone()
+            query = "SELECT side, npz, checksum FROM trajectories WHERE trial = ?"
+            trajectories = store._execute(query, (number,)).fetchall()
+        if row is None:
+            raise InputError(f"there is no trial {number} in {store.name}.")
         read = {side: read_trajectory(number, side, npz, checksum) for side, npz, checksum in trajectories}
         damaged = [side for side, trajectory in read.items() if trajectory is None]
         try:
             trial = read_trial(row[:-1], row[-1])
-            if not damaged:
-                raise CtxvalError(f"trial {number} can be read, so it is not set aside.")
-            sentence = f"trial {number} keeps its result, without the trajectory of the {' and the '.join(damaged)}"
         except InputError as error:
             executed = read.get("system")
             measurable = executed is not None and executed.ended == COMPLETE
             trial, sentence = _stand_in(store, dict(zip(COLUMNS.split(", "), row, strict=False)), measurable)
             sentence = f"{sentence}, because {error}"
+        else:
+            if not damaged:
+                raise InputError(f"trial {number} of {store.name} can be read, so it is not set aside.")
+            sentence = f"trial {number} keeps its result, without the trajectory of the {' and the '.join(damaged)}"
         kept = {name: repr(value) for name, value in zip([*COLUMNS.split(", "), "checksum"], row, strict=True)}
         npz = {side: base64.b64encode(bytes(content)).decode() for side, content, _ in trajectories if side in damaged}
-        store.put_in_place(trial, damaged, Change(SET_ASIDE, sentence, {"row": kept, "npz": npz}))
+        with store._transaction():
+            store._insert_change(Change(SET_ASIDE, sentence, {"row": kept, "npz": npz}))
+            values = row_of(trial)
+            assignments = f"{COLUMNS.replace(',', ' = ?,')} = ?, checksum = ?"
+            store._execute(f"UPDATE trials SET {assignments} WHERE number = ?", (*values, checksum_of(values), number))
+            for side in damaged:
+                store._execute("DELETE FROM trajectories WHERE trial = ? AND side = ?", (number, side))
     return sentence
 
 
@@ -61,6 +73,7 @@ def _stand_in(store: Store, values: Mapping[str, Any], measurable: bool) -> tupl
     opened = values["state"] == "open" and not measurable
     origin: Origin = values["origin"] if values["origin"] in get_args(Origin) else "manual"
     task = "its task" if known else "a task in the middle of the task space, as its own cannot be read"
+    state: State
     state, what = ("unmeasured", "is measured again") if measurable else ("failed", f"is a failed execution of {task}")
     sentence = f"trial {number} {what}"
     attempts = values["attempts"] if isinstance(values["attempts"], int) and 0 <= values["attempts"] < 2**53 else 0

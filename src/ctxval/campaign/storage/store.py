@@ -273,26 +273,6 @@ class Store(Database):
         if repr(read) != repr(row):
             raise InputError(f"trial {row[0]} is not stored: another task, or other values, would be read back.")
 
-    def raw(self, number: int) -> tuple[tuple[Any, ...], list[tuple[Any, ...]]]:
-        """Return the row of a trial with its checksum, and side, NPZ and checksum of its trajectories, unchecked."""
-        with self.snapshot():
-            row = self._execute(f"SELECT {COLUMNS}, checksum FROM trials WHERE number = ?", (number,)).fetchone()
-            sides = self._execute("SELECT side, npz, checksum FROM trajectories WHERE trial = ?", (number,)).fetchall()
-        if row is None:
-            raise InputError(f"there is no trial {number} in {self.name}.")
-        return row, sides
-
-    def put_in_place(self, trial: Trial, without: Iterable[str], change: Change) -> None:
-        """Replace all values of a trial that cannot be read, without its damaged trajectories, which the change has."""
-        with self._transaction():
-            row = row_of(trial)
-            assignments = f"{COLUMNS.replace(',', ' = ?,')} = ?, checksum = ?"
-            self._execute(f"UPDATE trials SET {assignments} WHERE number = ?", (*row, checksum_of(row), trial.number))
-            for side in without:
-                self._execute("DELETE FROM trajectories WHERE trial = ? AND side = ?", (trial.number, side))
-            self._read_back(row)
-            self._insert_change(change)
-
     def trials(self) -> list[Trial]:
         """Return all trials in their order. Raises a :class:`ForeignStoreError` if one is damaged."""
         trials: list[Trial] = []
@@ -301,7 +281,9 @@ class Store(Database):
                 try:
                     trial = read_trial(tuple(row), checksum)
                 except InputError as error:
-                    raise self._unreadable(len(trials), f"its trial {len(trials)} cannot be read, because {error}") from error
+                    raise self._unreadable(
+                        len(trials), f"its trial {len(trials)} cannot be read, because {error}"
+                    ) from error
                 if not rows.follows(trial, trials):
                     raise self._damaged(f"its trial {len(trials)} is missing, or is that of another task space")
                 trials.append(trial)
