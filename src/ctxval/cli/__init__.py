@@ -5,8 +5,7 @@ import sys
 import threading
 import time
 
-from ctxval.cli.base import BAD_INPUT, ERROR, err
-from ctxval.cli.commands import app
+from ctxval.cli.commands import Screen, app
 
 __all__ = ["app", "main"]
 
@@ -40,7 +39,7 @@ def _end_threads(status: int) -> None:
     while left := [each for each in threading.enumerate() if each is not threading.main_thread() and not each.daemon]:
         if time.monotonic() > until:
             names = ", ".join(each.name for each in left)
-            err.say(f"threads that the experiment's code has started go on, and end with this process: {names}.")
+            Screen(stderr=True).say(f"threads that the experiment's code has started go on, and end with this process: {names}.")
             sys.stdout.flush()
             os._exit(status)
         time.sleep(0.02)
