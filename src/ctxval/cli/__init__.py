@@ -22,10 +22,9 @@ def main() -> None:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     if sys.stdout is None:
-        err.say(
-            ERROR, "the standard output is closed, so no result can be printed: send it to a file, or to /dev/null."
-        )
-        sys.exit(BAD_INPUT)
+        advice = "send it to a file, or to /dev/null"
+        Screen(stderr=True).say(f"error: the standard output is closed, so no result can be printed: {advice}.")
+        sys.exit(2)
     try:
         app(prog_name="ctxval")
     except SystemExit as error:
@@ -39,7 +38,8 @@ def _end_threads(status: int) -> None:
     while left := [each for each in threading.enumerate() if each is not threading.main_thread() and not each.daemon]:
         if time.monotonic() > until:
             names = ", ".join(each.name for each in left)
-            Screen(stderr=True).say(f"threads that the experiment's code has started go on, and end with this process: {names}.")
+            sentence = "threads that the experiment's code has started go on, and end with this process"
+            Screen(stderr=True).say(f"{sentence}: {names}.")
             sys.stdout.flush()
             os._exit(status)
         time.sleep(0.02)

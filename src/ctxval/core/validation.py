@@ -173,7 +173,7 @@ class Validation:
             where = self.space.describe_point(parameters.points)
             ended = f"the model's closed loop {plan.model_trajectory.ended} for the task {where}"
             raise ModelError(f"{ended}: repair the model, or restrict the task space to tasks that it can perform.")
-        return plan
+        return replace(plan, model_trajectory=plan.model_trajectory.frozen())
 
     def execute(self, plan: Plan) -> Trajectory:
         """Execute S once."""

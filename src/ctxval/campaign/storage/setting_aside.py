@@ -43,16 +43,18 @@ def set_aside(store: Store, number: int) -> str:
         try:
             trial = read_trial(row[:-1], row[-1])
         except InputError as error:
-            executed = read.get("system")
-            measurable = executed is not None and executed.ended == COMPLETE
+            executed, predicted = read.get("system"), read.get("model")
+            measurable = executed is not None and executed.ended == COMPLETE and predicted is not None
             trial, sentence = _stand_in(store, dict(zip(COLUMNS.split(", "), row, strict=False)), measurable)
             sentence = f"{sentence}, because {error}"
         else:
             if not damaged:
                 raise InputError(f"trial {number} of {store.name} can be read, so it is not set aside.")
-            sentence = f"trial {number} keeps its result, without the trajectory of the {' and the '.join(damaged)}"
+            sentence = (
+                f"trial {number} keeps its result, without the trajectory of the {' and the '.join(map(str, damaged))}"
+            )
         kept = {name: repr(value) for name, value in zip([*COLUMNS.split(", "), "checksum"], row, strict=True)}
-        npz = {side: base64.b64encode(bytes(content)).decode() for side, content, _ in trajectories if side in damaged}
+        npz = {str(side): _text(content) for side, content, _ in trajectories if side in damaged}
         with store._transaction():
             store._insert_change(Change(SET_ASIDE, sentence, {"row": kept, "npz": npz}))
             values = row_of(trial)
@@ -61,6 +63,10 @@ def set_aside(store: Store, number: int) -> str:
             for side in damaged:
                 store._execute("DELETE FROM trajectories WHERE trial = ? AND side = ?", (number, side))
     return sentence
+
+
+def _text(content: Any) -> str:
+    return base64.b64encode(content).decode() if isinstance(content, bytes) else repr(content)
 
 
 def _stand_in(store: Store, values: Mapping[str, Any], measurable: bool) -> tuple[Trial, str]:
