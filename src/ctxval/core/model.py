@@ -80,7 +80,8 @@ def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
             raise ModelError(f"step of the model must return states of shape {np.shape(x)}, got {np.shape(reached)}.")
         return reached
 
-    A, B = jacobian(x, u) if jacobian is not None else central_differences(step, x, u)
+    pair = jacobian(x, u) if jacobian is not None else central_differences(step, x, u)
+    A, B = (as_floats("the model's Jacobian", each) for each in pair)
     if not (np.isfinite(A).all() and np.isfinite(B).all()):
         raise ModelError("the model's Jacobian is not finite along its own trajectory.")
     return A, B

@@ -10,6 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from ctxval._util.arrays import Array, as_floats, rows_of
+from ctxval._util.checked import require
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller, seeing
@@ -33,7 +34,7 @@ class Outputs(ShortRepr):
         if callable(given):
             self.function: OutputsLike = given
         else:
-            self.function = [int(i) for i in given]
+            self.function = [int(i) for i in require("outputs", Sequence[int], given)]
             if not self.function or len(set(self.function)) < len(self.function) or min(self.function) < 0:
                 raise InputError(f"outputs must be a function h(x), or different indices of states, got {given!r}.")
         self._batched: bool | None = None
