@@ -146,8 +146,8 @@ def test_a_model_that_failed_executions_falsify_ends_as_falsified(folder: Path) 
     text = toml.read_text().replace('type = "FinalState"', 'type = "MaximumDeviation"').replace("norm = 2\n", "")
     toml.write_text(text)
     result = invoke(*RUN, "--threshold", "0.02", "--json")
-    found: dict[str, Any] = json.loads(result.stdout)
-    assert (found["verdict"], found["failed"], result.exit_code) == ("falsified", 2, 1), name
+    summary: dict[str, Any] = json.loads(result.stdout)
+    assert (summary["verdict"], summary["failed"], result.exit_code) == ("falsified", 2, 1), name
 
 
 @pytest.mark.slow

@@ -254,9 +254,9 @@ def of_whole_suite(
     bounds = np.where((largest >= 0) & (largest <= threshold), largest, np.inf)
     names = tuple(name for name, bound in zip(suite.task_names, bounds, strict=True) if np.isfinite(bound))
     share, count = len(names) / len(suite), sum(trial.executed for trial in trials)
-    known: dict[str, Any] = {"share": share, "tasks": names, "executions": count, "assumptions": (EXECUTED_AGAIN,)}
+    numbers: dict[str, Any] = {"share": share, "tasks": names, "executions": count, "assumptions": (EXECUTED_AGAIN,)}
     statement = whole_suite_statement(len(names), len(suite), threshold, units)
-    return Envelope(suite, threshold, confidence, statement, **known, units=units, _bounds=bounds)
+    return Envelope(suite, threshold, confidence, statement, **numbers, units=units, _bounds=bounds)
 
 
 def has_tests(recorder: TrialRecorder, options: CertificateOptions) -> bool:

@@ -242,7 +242,7 @@ class WatchState(ShortRepr):
 
         A run whose statistics are those of an earlier one is the same recording, which counts once: the state stays.
         """
-        if any(self._is_that_of(k, statistics) for k, known in enumerate(self.distances) if known == distance):
+        if any(self._is_that_of(k, statistics) for k, earlier in enumerate(self.distances) if earlier == distance):
             return self
         channels = tuple(channel.after(statistics.get(channel.name)) for channel in self.channels)
         of_channels = [channel.evidence() for channel in channels]
@@ -261,8 +261,8 @@ class WatchState(ShortRepr):
 
     def _is_that_of(self, k: int, statistics: Mapping[str, Statistic]) -> bool:
         values = [(each.later[k], statistics.get(each.name)) for each in self.channels]
-        known = [pair for pair in values if pair != (None, None)]
-        return bool(known) and all(a and b and math.isclose(a.value, b.value, rel_tol=1e-9) for a, b in known)
+        pairs = [pair for pair in values if pair != (None, None)]
+        return bool(pairs) and all(a and b and math.isclose(a.value, b.value, rel_tol=1e-9) for a, b in pairs)
 
     @property
     def expired(self) -> bool:

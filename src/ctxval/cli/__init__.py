@@ -35,9 +35,11 @@ def main() -> None:
 def _end_threads(status: int) -> None:
     """End this process if threads of users' modules go on, for which Python would wait without end."""
     until = time.monotonic() + _GRACE
-    while left := [each for each in threading.enumerate() if each is not threading.main_thread() and not each.daemon]:
+    while running := [
+        each for each in threading.enumerate() if each is not threading.main_thread() and not each.daemon
+    ]:
         if time.monotonic() > until:
-            names = ", ".join(each.name for each in left)
+            names = ", ".join(each.name for each in running)
             sentence = "threads that the experiment's code has started go on, and end with this process"
             Screen(stderr=True).say(f"{sentence}: {names}.")
             sys.stdout.flush()

@@ -53,10 +53,10 @@ def set_aside(store: Store, number: int) -> str:
             sentence = (
                 f"trial {number} keeps its result, without the trajectory of the {' and the '.join(map(str, damaged))}"
             )
-        kept = {name: repr(value) for name, value in zip([*COLUMNS.split(", "), "checksum"], row, strict=True)}
+        cells = {name: repr(value) for name, value in zip([*COLUMNS.split(", "), "checksum"], row, strict=True)}
         npz = {str(side): _text(content) for side, content, _ in trajectories if side in damaged}
         with store._transaction():
-            store._insert_change(Change(SET_ASIDE, sentence, {"row": kept, "npz": npz}))
+            store._insert_change(Change(SET_ASIDE, sentence, {"row": cells, "npz": npz}))
             values = row_of(trial)
             assignments = f"{COLUMNS.replace(',', ' = ?,')} = ?, checksum = ?"
             store._execute(f"UPDATE trials SET {assignments} WHERE number = ?", (*values, checksum_of(values), number))
@@ -74,11 +74,11 @@ def _stand_in(store: Store, values: Mapping[str, Any], measurable: bool) -> tupl
     number, space = values["number"], Provenance.of(store.description()).space
     if space is None:
         raise InputError(f"trial {number} cannot be set aside: the task space in {store.name} cannot be read either.")
-    point, known = _task_of(values, space)
-    measurable &= known
+    point, readable = _task_of(values, space)
+    measurable &= readable
     opened = values["state"] == "open" and not measurable
     origin: Origin = values["origin"] if values["origin"] in get_args(Origin) else "manual"
-    task = "its task" if known else "a task in the middle of the task space, as its own cannot be read"
+    task = "its task" if readable else "a task in the middle of the task space, as its own cannot be read"
     state: State
     state, what = ("unmeasured", "is measured again") if measurable else ("failed", f"is a failed execution of {task}")
     sentence = f"trial {number} {what}"
