@@ -3,7 +3,7 @@
 ``python benchmarks/attack.py --inputs 20200`` makes each input from its family, its number and the seed alone, and runs
 its command line in a process of its own, bounded in time, memory and files. None may end with a traceback, hang, take
 much memory, run code, read or write elsewhere, tell a secret, change files that are no outputs, give another answer for
-the same data in another format, or send the terminal what steers it. The counts go to
+the same data in another format, make a store unreadable, or send the terminal what steers it. The counts go to
 benchmarks/results/attack.jsonl, from which it goes on; `benchmarks/reliability.py` makes the page. What went wrong is
 printed; ``python benchmarks/attack.py --repeat FAMILY NUMBER --keep FOLDER`` repeats it.
 """
@@ -34,7 +34,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
 from ctxval._util.json_lines import JsonLines  # noqa: E402
-from hostile import archives, arguments, clothes, doors, experiments, logs, oracles, served, stores  # noqa: E402
+from hostile import archives, arguments, clothes, doors, experiments, logs, numbers, oracles, served, stores  # noqa: E402
 from hostile.cage import SENTINEL, STATUSES, Case, Outcome, Watched, carry_out, declared  # noqa: E402
 from hostile.values import Rng, pick  # noqa: E402
 
@@ -246,7 +246,7 @@ def _arguments(rng: Rng, folder: Path, base: Path) -> Case:
 
 
 FAMILIES: dict[str, Family] = {
-    "damaged": Family("stores with changed bytes", 0.12, _store(stores.damaged), own=True),
+    "damaged": Family("stores with changed bytes", 0.09, _store(stores.damaged), own=True),
     "crafted": Family("stores changed by SQL", 0.14, _store(stores.crafted)),
     "crafted-own": Family("the same, for stores that this user made", 0.05, _store(stores.crafted), own=True),
     "coded": Family("stores whose settings name code", 0.05, _store(stores.coded, "a.sqlite")),
@@ -262,6 +262,7 @@ FAMILIES: dict[str, Family] = {
     "secrets": Family("systems that use secrets", 0.02, doors.secret_system, own=True),
     "served": Family("requests to `ctxval serve`", 0.02, served.case, own=True, each=served.REQUESTS),
     "arguments": Family("arguments", 0.05, _arguments, own=True),
+    "numbers": Family("-0.0, NaN and others for every number that is stored", 0.03, numbers.case, own=True),
 }
 
 

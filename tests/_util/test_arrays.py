@@ -120,3 +120,41 @@ def test_messages_about_large_arrays_stay_short() -> None:
     with pytest.raises(InputError) as caught:
         as_floats("x", [["one"] * 10_000] * 100)
     assert len(str(caught.value)) < 5000
+
+
+NO_NUMBERS = [
+    "1_0",
+    b"1",
+    True,
+    np.True_,
+    1j,
+    np.ma.masked,
+    ["1", "2"],
+    [1.0, "2"],
+    [True, 1.5],
+    [[1.0, 2.0], [3.0, False]],
+    (1.0, np.bool_(True)),
+    [np.array([True, False]), np.array([1.0, 2.0])],
+    [1.0, 2.0 + 0j],
+    np.array(["1", "2"]),
+    np.array([b"1"]),
+    np.array([True]),
+    np.array([1, "2"], dtype=object),
+    np.array([True, 2.0], dtype=object),
+    np.array([1 + 0j]),
+    np.array([1], dtype="M8[s]"),
+    np.array([1], dtype="m8[s]"),
+    np.ma.masked_array([1.0, 2.0], [False, True]),
+    [np.ma.masked_array([1.0, 2.0], [False, True])],
+]
+
+
+@pytest.mark.parametrize("value", NO_NUMBERS, ids=repr)
+def test_what_numpy_would_convert_to_numbers_is_refused(value: object) -> None:
+    with pytest.raises(InputError, match="x must be numbers"):
+        as_floats("x", value)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("value", [3, 2.5, np.float32(1), [1, 2.0], np.arange(3), (np.float16(1), 2), [], [[], []]])
+def test_numbers_of_every_kind_are_numbers(value: object) -> None:
+    np.testing.assert_array_equal(as_floats("x", value), np.array(value, dtype=np.float64))  # type: ignore[arg-type]

@@ -169,3 +169,27 @@ def test_pictures_of_suites_have_no_curve_between_tasks() -> None:
     assert "go to" in plot.worst_trajectories(campaign).get_suptitle()
     with pytest.raises(InputError, match=r"no curve of the distance between its tasks; plot\.convergence"):
         plot.surrogate_slice(campaign)
+
+
+@pytest.mark.parametrize("share", [1.25, 0.6, 1e-3])
+@pytest.mark.parametrize("kind", [None, WholeSuite()])
+def test_the_envelope_of_a_suite_that_was_executed_is_its_tasks_below_the_threshold(kind: Any, share: float) -> None:
+    given = validation()
+    distances = true_distances(given)
+    threshold = share * distances.max()
+    campaign = Campaign(given, search=Random(), seed=1).run(6)
+    envelope = campaign.envelope(threshold, certificate=None if kind is None else CertificateOptions(kind))
+    trusted = distances <= threshold
+    assert envelope.doubt is None
+    assert envelope.tasks == tuple(name for name, below in zip(COARSE.task_names, trusted, strict=True) if below)
+    assert envelope.share == trusted.mean()
+    for name, below, distance in zip(COARSE.task_names, trusted, distances, strict=True):
+        assert envelope.bound({"task": name}) == pytest.approx(distance if below else np.inf, rel=1e-12)
+
+
+def test_a_failed_task_of_a_suite_is_not_trusted() -> None:
+    campaign = Campaign(validation(), search=Random(), seed=1).run(5)
+    (name,) = set(COARSE.task_names) - set(names(campaign))
+    campaign.add({"task": name}, failed="it fell")
+    envelope = campaign.envelope(100.0)
+    assert set(envelope.tasks or ()) == set(COARSE.task_names) - {name}

@@ -97,6 +97,15 @@ def test_a_table_of_runs_is_judged_and_nothing_is_stored(folder: Path, invoke: I
 
 
 @pytest.mark.slow
+def test_a_recording_that_is_given_twice_counts_once(folder: Path, invoke: Invoke) -> None:
+    once = report(invoke("same0.csv", "same1.csv", "--json"))
+    (folder / "copy.csv").write_bytes((folder / "same0.csv").read_bytes())
+    twice = report(invoke("same0.csv", "same1.csv", "copy.csv", "same1.csv", "--json"))
+    assert once["watch"] == twice["watch"]
+    assert (len(twice["runs"]), len(twice["counted_before"]), once["counted_before"]) == (2, 2, [])
+
+
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_a_system_that_is_executed_is_validated_anew_in_another_store(folder: Path, invoke: Invoke) -> None:
     """`ctxval ask` would open a trial that only people execute."""

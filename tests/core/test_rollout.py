@@ -1,13 +1,17 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
 from ctxval import Task
 from ctxval.core.controller import AffineFeedback
 from ctxval.core.rollout import rollout
-from ctxval.errors import ShapeError
+from ctxval.errors import InputError, ShapeError
 from ctxval.models import Linear
+from ctxval.systems import Simulated
 from ctxval.systems.functions import rk4
 
 
@@ -141,3 +145,62 @@ def test_a_step_that_works_in_place_does_not_change_the_recorded_inputs() -> Non
     loop = rollout(weak, lambda t, x: np.ones(1), Task([0.0], horizon=3, dt=0.1))
     np.testing.assert_array_equal(loop.inputs, np.ones((3, 1)))
     np.testing.assert_array_equal(loop.states[:, 0], [0.0, 0.5, 1.0, 1.5])
+
+
+class Returning:
+    """A model of a user's class, which returns its states in another form."""
+
+    def __init__(self, form: Callable[[np.ndarray], Any]) -> None:
+        self.form = form
+
+    def step(self, x: np.ndarray, u: np.ndarray) -> Any:
+        return self.form(0.9 * x + u)
+
+
+FORMS: dict[str, Callable[[np.ndarray], Any]] = {
+    "complex": lambda x: x + 0j,
+    "complex list": lambda x: [complex(value) for value in x],
+    "masked": lambda x: np.ma.masked_array(x, [False, True]),
+    "texts": lambda x: [str(value) for value in x],
+    "text array": lambda x: x.astype(str),
+    "booleans": lambda x: x > 0,
+    "a boolean in a list": lambda x: [x[0], True],
+    "objects": lambda x: np.array([x[0], str(x[1])], dtype=object),
+}
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_states_and_inputs_that_are_no_real_numbers_are_refused(name: str) -> None:
+    form, task = FORMS[name], Task([1.0, 2.0], horizon=3, dt=0.1)
+
+    def late(t: int, x: np.ndarray) -> Any:
+        return form(x) if t == 2 else x
+
+    for step, controller in (
+        (Returning(form).step, lambda t, x: x),
+        (Returning(lambda x: x).step, lambda t, x: form(x)),
+        (Returning(lambda x: x).step, late),
+    ):
+        with pytest.raises(InputError, match="must be numbers"):
+            rollout(step, controller, task)
+        system = Simulated(step)
+        with pytest.raises(InputError, match="must be numbers"):
+            system.execute(controller, task)
+
+
+def test_parts_that_work_in_place_change_nothing_that_is_recorded() -> None:
+    def in_place(t: int, x: np.ndarray) -> np.ndarray:
+        x -= 1
+        return x
+
+    def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        u *= 0.5
+        x += u
+        return x
+
+    task = Task([1.0, 2.0], horizon=4, dt=0.1)
+    expected = rollout(lambda x, u: x + 0.5 * u, lambda t, x: x - 1, task)
+    loop = rollout(step, in_place, task)
+    np.testing.assert_array_equal(loop.states, expected.states)
+    np.testing.assert_array_equal(loop.inputs, expected.inputs)
+    assert task.initial_state.tolist() == [1.0, 2.0]

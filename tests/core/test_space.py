@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -289,3 +290,26 @@ def test_a_function_of_parameters_becomes_one_of_unit_points(space: TaskSpace) -
 
 def test_a_constant_function_of_parameters_has_one_value_a_point(space: TaskSpace) -> None:
     np.testing.assert_array_equal(space.unit_function(lambda p: 2)(np.zeros((3, 4))), [2.0, 2.0, 2.0])
+
+
+@pytest.mark.parametrize("bound", [(-1.5e308, 1.5e308), ([0.0, -1e308], [1.0, 1e308]), (-np.finfo(float).max, 1e300)])
+def test_a_range_that_is_too_large_for_a_number_is_refused(bound: tuple[Any, Any]) -> None:
+    with pytest.raises(InputError, match="finite range"):
+        TaskSpace(goal=bound)
+
+
+def test_users_code_cannot_change_the_space_or_the_parameters() -> None:
+    low, high = np.array([0.0, 1.0]), np.array([2.0, 3.0])
+    space = TaskSpace(goal=(low, high), load=(-1, 1))
+    point = np.array([1.0, 2.0, 0.5])
+    p, batch = space.parameters(point), space.parameters(np.stack([space.low, space.high]))
+    low += 5
+    point += 5
+    for array in (space.low, space.high, p.points, batch.points):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = np.nan
+    goal, loads = p.goal, batch.load
+    goal *= 7  # a copy, which may be changed
+    loads *= 7
+    assert (space.low.tolist(), space.high.tolist()) == ([0.0, 1.0, -1.0], [2.0, 3.0, 1.0])
+    assert (p.points.tolist(), p.goal.tolist(), batch.load.tolist()) == ([1.0, 2.0, 0.5], [1.0, 2.0], [-1.0, 1.0])

@@ -230,3 +230,9 @@ def test_a_step_that_raises_leaves_what_was_recorded_before() -> None:
     np.testing.assert_array_equal(trajectory.inputs[:, 0], [0.0, 1.0, 2.0])
     with pytest.raises(RuntimeError):
         systems.Simulated(step).execute(lambda t, x: np.zeros(1), Task([1.0], goal=[1.0], horizon=8, dt=0.1))
+
+
+@pytest.mark.parametrize("given", [["0", "1"], [True], [1.5], "01", [np.bool_(True)]])
+def test_outputs_that_are_no_indices_are_refused(given: Any) -> None:
+    with pytest.raises(InputError, match="outputs must be"):
+        Outputs(given)

@@ -537,3 +537,35 @@ def test_a_batch_with_a_distance_that_is_negative_or_nan_is_refused_like_one_tas
 
 def test_no_points_have_no_distances() -> None:
     assert make_validation().distances(np.empty((0, 1))).shape == (0,)
+
+
+@pytest.mark.parametrize("value", [-0.0, np.float32(-0.0), np.array(-0.0), 0.0])
+def test_a_distance_of_minus_zero_is_zero(value: object) -> None:
+    validation = make_validation().with_parts(distance=lambda model, system, task: value)
+    distance = validation.outcome(validation.space.low).distance
+    assert (distance, np.signbit(distance)) == (0.0, False)
+
+
+@pytest.mark.parametrize("value", [np.ma.masked, np.ma.masked_array(1.0, True), True, "0.5", 1j, [0.5, "1"], None])
+def test_a_distance_that_numpy_would_convert_to_a_number_is_refused(value: object) -> None:
+    validation = make_validation().with_parts(distance=lambda model, system, task: value)
+    with pytest.raises(DistanceError):
+        validation.outcome(validation.space.low)
+
+
+def test_a_task_that_keeps_an_array_of_its_function_does_not_change_with_it() -> None:
+    start, reference = np.zeros(2), np.zeros((4, 2))
+    task = Task(start, horizon=3, dt=0.1, reference=reference, environment={"place": start})
+    start += 1
+    reference += 1
+    assert not task.initial_state.any()
+    assert not task.reference.any()
+    assert not task.environment["place"].any()
+
+
+def test_a_plan_that_people_hold_cannot_be_changed() -> None:
+    plan = make_validation().plan(make_validation().space.low)
+    promised = plan.model_trajectory
+    for array in (promised.times, promised.states, promised.inputs, plan.task.reference, plan.parameters.points):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0.0

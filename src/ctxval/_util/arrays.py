@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import math
 import reprlib
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -28,22 +29,31 @@ _SHOWN.maxstring = _SHOWN.maxother = 200
 
 
 def as_floats(name: str, value: ArrayLike) -> Array:
-    if _is_masked(value):
+    """Return numbers as an array. What numpy would convert is refused: texts, booleans, masked and complex numbers."""
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return value
+    if _has(value, np.ma.is_masked, np.ma.MaskedArray):
         advice = "fill in the masked entries, or replace them with NaN"
         raise InputError(f"{name} must be numbers without masked entries; {advice}.")
     try:
-        if np.iscomplexobj(value):
+        array = np.asarray(value)
+        items = array.tolist() if array.dtype == object else value
+        if array.dtype.kind not in "fiuO" or _has(items, _is_no_number, str | bytes | bool | np.bool_ | np.ndarray):
             raise TypeError
-        return np.asarray(value, dtype=np.float64)
+        return np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name} must be numbers, got {_SHOWN.repr(value)}.") from error
 
 
-def _is_masked(value: object) -> bool:
-    """Return whether a value has masked entries; ``numpy.asarray`` would silently return the numbers below the mask."""
+def _has(value: object, wrong: Callable[[Any], bool], kinds: Any) -> bool:
+    """Return whether a value of some kinds, or one in lists of lists, is a wrong one."""
     if isinstance(value, list | tuple):
-        return any(_is_masked(item) for item in value if isinstance(item, list | tuple | np.ma.MaskedArray))
-    return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value))
+        return any(_has(item, wrong, kinds) for item in value)
+    return isinstance(value, kinds) and bool(wrong(value))
+
+
+def _is_no_number(value: Any) -> bool:
+    return not isinstance(value, np.ndarray) or value.dtype.kind not in "fiuO"
 
 
 def as_finite(name: str, value: ArrayLike) -> Array:
@@ -54,6 +64,14 @@ def as_finite(name: str, value: ArrayLike) -> Array:
             raise InputError(f"{name} must be finite, got {array.tolist()}.")
         place = tuple(np.argwhere(~finite)[0].tolist())
         raise InputError(f"{name} must be finite, got {array[place]} at {list(place)}.")
+    return array
+
+
+def read_only(array: Array) -> Array:
+    """Return an array that neither its reader nor the owner of the given one can change."""
+    if array.flags.writeable:
+        array = array.copy()
+        array.setflags(write=False)
     return array
 
 

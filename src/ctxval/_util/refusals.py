@@ -29,7 +29,7 @@ def reworded(what: str, *kinds: type[BaseException], to: type[CtxvalError] = Inp
     The kinds are those of expected errors, whose messages are reasons. Without kinds, it is code of others that may
     raise anything; the name of an exception is then a part of the reason, and errors of ctxval are raised as they are.
     """
-    caught = kinds or (Exception,)
+    caught = kinds or (Exception, SystemExit)
     try:
         yield
     except caught as error:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from typing import TypeVar
+
+Number = TypeVar("Number", int, float)
 
 LONGEST = 2_000
 """Largest number of characters of a failure's text that are kept: half from its beginning, half from its end."""
@@ -36,6 +39,13 @@ def shortened(text: str, longest: int = LONGEST) -> str:
     tail = room // 2
     head = room - tail
     return text[:head] + _gap(len(text) - head - tail) + text[len(text) - tail :]
+
+
+def number_in(text: str, kind: type[Number]) -> Number:
+    """Return the number that a text is; a ValueError otherwise, also for ``1_0`` and digits of other scripts."""
+    if "_" in text or not text.isascii():
+        raise ValueError(f"{text!r} is not a number")
+    return kind(text)
 
 
 def enumerated(items: Iterable[object], most: int) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctxval._util.columns import CsvTable, column_of, conversion
-from ctxval._util.texts import shortened, unguarded
+from ctxval._util.texts import number_in, shortened, unguarded
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import Execution, OpenTrial
 from ctxval.campaign.telling import SuppliedResult, require_file
@@ -138,7 +138,7 @@ def _table(path: Path, space: TaskSpace, reading: Mapping[str, Any]) -> list[Kno
     return runs
 
 
-_QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)", re.DOTALL)
+_QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?![\d_])(.*)", re.DOTALL)
 
 
 def parameters_from(settings: Sequence[str], space: TaskSpace) -> dict[str, Any]:
@@ -187,7 +187,8 @@ def _value(name: str, text: str, space: TaskSpace) -> float | list[float]:
         quantity = f"{number} {given_unit}"
         matched = _QUANTITY.fullmatch(quantity)
         try:
-            numbers.append(float(quantity if matched is None else matched[1]))  # NaN and infinity are refused elsewhere
+            # NaN and infinity are refused elsewhere.
+            numbers.append(number_in(quantity if matched is None else matched[1], float))
         except ValueError:
             raise InputError(f"--set: {name} must be a number, got {quantity.strip()!r}.") from None
         given = "" if matched is None else matched[2].strip().removeprefix("[").removesuffix("]").strip()

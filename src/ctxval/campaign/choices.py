@@ -78,7 +78,7 @@ class Execution:
             raise InputError("a trajectory, a distance or the reason of a failure must be given.")
         if distance is not None and not 0 <= distance < np.inf:
             raise InputError(f"the distance must be a finite number >= 0, got {distance!r}.")
-        return cls(trajectory, None if distance is None else float(distance), failed)
+        return cls(trajectory, None if distance is None else float(distance) + 0.0, failed)  # -0.0 is 0.0
 
     @classmethod
     def before_failure(

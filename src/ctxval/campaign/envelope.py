@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import dynamics_diagnostics as diagnostics
-from ctxval.certificates.automatic import Automatic
+from ctxval.certificates.automatic import Automatic, WholeSuite
 from ctxval.certificates.drawn_distances import DrawnDistances
 from ctxval.certificates.dynamics import Dynamics, draws_for
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
@@ -31,6 +32,8 @@ from ctxval.certificates.envelope import (
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.sample import without_success
+from ctxval.certificates.sentences.statements import EXECUTED_AGAIN, whole_suite_statement
+from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trial import Trial, Trials
 from ctxval.errors import InputError
 from ctxval.learning import LearnedDynamics
@@ -49,7 +52,7 @@ class EnvelopeSearch:
 
     def __init__(self, interval: IntervalSearch) -> None:
         kind = interval.options.kind
-        if not isinstance(kind, Automatic | Dynamics):
+        if not isinstance(kind, Automatic | Dynamics | WholeSuite):
             raise InputError(f"an envelope needs one of the certificates auto and dynamics, got {kind.name!r}.")
         self._interval, self._recorder = interval, interval.recorder
         self._threshold, self._confidence = interval.limit, interval.options.confidence
@@ -59,6 +62,8 @@ class EnvelopeSearch:
         """Return the envelope that the executions give, or why there is none. The system is never executed."""
         space, trials = self._recorder.validation.space, self._recorder.trials.ended
         threshold, confidence = self._threshold, self._confidence
+        if not self._recorder.has_tasks and isinstance(space, TaskSuite):
+            return of_whole_suite(space, trials, threshold, confidence, self._recorder.validation.labels.units)
         unknown = next((trial for trial in without_success(trials) if trial.least <= threshold), None)
         if unknown is not None:
             why = f"trial {unknown.number} has no distance, so nothing is known of its task; execute it again"
@@ -236,8 +241,28 @@ class EnvelopeSearch:
         return DrawnDistances(points, values, beyond, away / diagnostics.POCKET, crossed)
 
 
+def of_whole_suite(
+    suite: TaskSuite, trials: Sequence[Trial], threshold: float, confidence: float, units: str
+) -> Envelope:
+    """Return the envelope of a suite whose tasks were all executed: those whose distances keep the threshold."""
+    largest = np.full(len(suite), -np.inf)
+    for trial in trials:
+        if (distance := trial.distance) is None and trial in without_success(trials):
+            distance = np.inf  # of a failed execution
+        row = int(suite.rows_at(trial.unit_point))
+        largest[row] = max(largest[row], -np.inf if distance is None else distance)
+    bounds = np.where((largest >= 0) & (largest <= threshold), largest, np.inf)
+    names = tuple(name for name, bound in zip(suite.task_names, bounds, strict=True) if np.isfinite(bound))
+    share, count = len(names) / len(suite), sum(trial.executed for trial in trials)
+    numbers: dict[str, Any] = {"share": share, "tasks": names, "executions": count, "assumptions": (EXECUTED_AGAIN,)}
+    statement = whole_suite_statement(len(names), len(suite), threshold, units)
+    return Envelope(suite, threshold, confidence, statement, **numbers, units=units, _bounds=bounds)
+
+
 def has_tests(recorder: TrialRecorder, options: CertificateOptions) -> bool:
     """Return whether the tests of an envelope were executed, so that it is worth computing; nothing is learned."""
+    if not recorder.has_tasks:
+        return True
     if not isinstance(options.kind, Automatic | Dynamics) or not recorder.search.uses_prediction:
         return False
     completed = recorder.trials.completed

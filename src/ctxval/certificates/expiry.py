@@ -238,7 +238,12 @@ class WatchState(ShortRepr):
     ratio: float | None = None  #: of its statistics since then to those certified, or of the distance to the threshold
 
     def after(self, run: str, statistics: Mapping[str, Statistic], distance: float | None = None) -> Self:
-        """Return the state after another run; a channel without a statistic of it says nothing of it."""
+        """Return the state after another run; a channel without a statistic of it says nothing of it.
+
+        A run whose statistics are those of an earlier one is the same recording, which counts once: the state stays.
+        """
+        if any(self._is_that_of(k, statistics) for k, earlier in enumerate(self.distances) if earlier == distance):
+            return self
         channels = tuple(channel.after(statistics.get(channel.name)) for channel in self.channels)
         of_channels = [channel.evidence() for channel in channels]
         logs = np.array([log for log, _ in of_channels])
@@ -253,6 +258,11 @@ class WatchState(ShortRepr):
         cause, since = channels[largest], of_channels[largest][1]
         alarm = len(runs) if evidence >= 1 / self.false_alarms else None
         return replace(after, alarm=alarm, since=since, cause=cause.name, ratio=cause.ratio(since))
+
+    def _is_that_of(self, k: int, statistics: Mapping[str, Statistic]) -> bool:
+        values = [(each.later[k], statistics.get(each.name)) for each in self.channels]
+        pairs = [pair for pair in values if pair != (None, None)]
+        return bool(pairs) and all(a and b and math.isclose(a.value, b.value, rel_tol=1e-9) for a, b in pairs)
 
     @property
     def expired(self) -> bool:

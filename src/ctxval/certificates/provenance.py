@@ -69,6 +69,8 @@ class Provenance(ShortRepr):
             elif change.what == "replaced":
                 numbers = ", ".join(change.content.get("before", {}))
                 remarks.append(withdrawals.REPLACED.format(numbers=numbers, why=change.why))
+            elif change.what == "set aside":
+                remarks.append(withdrawals.SET_ASIDE.format(why=change.why))
         shares = described.get(DISTRIBUTION)
         stated = None if shares is None else distribution_text(shares)
         others = tuple(beside)

@@ -8,6 +8,7 @@ import io
 import os
 import sys
 import tomllib
+import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
@@ -20,6 +21,7 @@ import typer
 from rich.table import Table
 
 from ctxval import Trial, Verdict, searches
+from ctxval._util.cores import exits_as_exceptions
 from ctxval._util.describe import describe
 from ctxval._util.files import make_folder_of, require_made_by_us
 from ctxval._util.progress import progress_shown
@@ -30,7 +32,7 @@ from ctxval.campaign.goals_of_model import GoalWarning
 from ctxval.campaign.storage.disks import StoreWarning
 from ctxval.certificates import KINDS
 from ctxval.certificates.bounds import as_text
-from ctxval.cli.commands import TEXTS, Screen, app, line
+from ctxval.cli.commands import TEXTS, Screen, app, line, number_parser
 from ctxval.core.experiment import UnitsWarning
 from ctxval.core.plan import DistanceWarning
 from ctxval.core.trial import Trials
@@ -103,6 +105,7 @@ def _described(parameter: inspect.Parameter, command: str, words: Mapping[str, A
     words = {**_WORDS, **words}
     known: dict[str, Any] = {"help": text} if isinstance(text, str) else text
     known = {key: value.format(**words) if isinstance(value, str) else value for key, value in known.items()}
+    known |= number_parser(parameter.annotation)
     if "argument" in known:
         info: Any = typer.Argument(metavar=known.pop("argument"), **known)
     else:
@@ -114,12 +117,16 @@ def _described(parameter: inspect.Parameter, command: str, words: Mapping[str, A
     return parameter.replace(annotation=Annotated[parameter.annotation, info], kind=parameter.KEYWORD_ONLY)
 
 
+_OURS = Path(__file__).parents[1]
+
+
 def _run(function: Callable[[], Any], as_json: bool, stated: set[str]) -> None:
     warnings.showwarning = _show_warning
     failure, status = None, 0
     out.quiet = notes.quiet = as_json
     try:
-        with _stdout_to_stderr() if as_json else nullcontext() as stdout, progress_shown(not as_json, err):
+        capture = _stdout_to_stderr() if as_json else nullcontext()
+        with capture as stdout, progress_shown(not as_json, err), exits_as_exceptions():
             result = function()
             report, status = result if isinstance(result, tuple) else (result, 0)
             if stdout is not None:
@@ -138,7 +145,9 @@ def _run(function: Callable[[], Any], as_json: bool, stated: set[str]) -> None:
         if isinstance(error.__context__, BrokenPipeError):
             raise typer.Exit(CUT_OFF) from None  # the reader of the output has ended, as in `| head`
         # Python's own exit status here would be 1, which means that a model is falsified.
-        failure, status = reason_of(error), CANNOT_GO_ON
+        failure, status = _reason_of_others(error), CANNOT_GO_ON
+        if isinstance(error, OSError) and not _in_a_folder():
+            failure, status = "the current folder was deleted: change to another one.", BAD_INPUT
     finally:
         out.quiet = notes.quiet = False
     if failure is not None:
@@ -175,6 +184,23 @@ def _stdout_to_stderr() -> Iterator[Any]:
         finally:
             sys.stdout.flush()
             os.dup2(ours.fileno(), number)
+
+
+def _reason_of_others(error: BaseException) -> str:
+    """Return why users' code or the operating system ended a command."""
+    if isinstance(error, OSError) and error.strerror:
+        what = "the output cannot be written" if error.filename is None else f"{error.filename}"
+        return f"{what}: {error.strerror}."
+    places = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
+    modules = [place for place in places if not Path(place).is_relative_to(_OURS)]
+    return f"{modules[-1]} ended: {reason_of(error)}" if isinstance(error, SystemExit) and modules else reason_of(error)
+
+
+def _in_a_folder() -> bool:
+    try:
+        return bool(os.getcwd())
+    except OSError:
+        return False
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *place: Any, **_: Any) -> None:
@@ -230,7 +256,9 @@ def parsed(text: str) -> Any:
     """Return the number, Boolean, list or quoted text that a TOML file would contain, or else the text itself."""
     with suppress(tomllib.TOMLDecodeError, RecursionError):
         match tomllib.loads(f"value = {text}"):
-            case {"value": str() | int() | float() | list() as value, **others} if not others:
+            case {"value": str() | int() | float() | list() as value, **others} if not others and "_" not in text:
+                return value
+            case {"value": str() | list() as value, **others} if not others:
                 return value
     return text
 

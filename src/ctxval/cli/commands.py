@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib
 import tomllib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -15,7 +15,7 @@ from rich.segment import Segment
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 
-from ctxval._util.texts import shortened, visible
+from ctxval._util.texts import number_in, shortened, visible
 from ctxval._util.version import VERSION
 
 
@@ -88,6 +88,24 @@ def _harmless_errors() -> Iterator[None]:
             message = line(error.format_message())
             vars(error)["format_message"] = lambda: message
         raise
+
+
+def number_parser(annotation: Any) -> dict[str, Any]:
+    """Return how typer reads the number of a parameter; empty if it is none.
+
+    Python's own reading would take ``1_0`` and digits of other scripts, too.
+    """
+    kind = next((kind for kind in (int, float) if kind in (annotation, *get_args(annotation))), None)
+    if kind is None:
+        return {}
+
+    def parsed(text: Any) -> Any:
+        with suppress(ValueError):
+            return number_in(text, kind) if isinstance(text, str) else text
+        raise typer.BadParameter(f"{text!r} is not a valid {name}.")
+
+    name = parsed.__name__ = "integer" if kind is int else "float"
+    return {"parser": parsed}
 
 
 app = typer.Typer(

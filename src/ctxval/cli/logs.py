@@ -53,7 +53,7 @@ def watch(
     how = {"resample": resample, "start_tolerance": start_tolerance}
     runs = list(_runs(opened, logs, reading, parameters, how))  # all are read before any is judged
     watching = opened.campaign.watch(limit, false_alarms)
-    judged, skipped = list[dict[str, Any]](), list[dict[str, str]]()
+    judged, seen, skipped = list[dict[str, Any]](), list[dict[str, Any]](), list[dict[str, str]]()
     if resample:
         missing = "steps with missing samples are no steps of the system, and look like a change"
         notes.say(f"--resample interpolates: {missing}.")
@@ -62,20 +62,22 @@ def watch(
             try:
                 if execution.trajectory is None:
                     raise ExecutionError(execution.failed or "it has no trajectory")
-                state = watching.update(execution, task, name=name)
+                before, state = watching.state, watching.update(execution, task, name=name)
             except ExecutionError as error:
                 skipped.append({"run": name, "reason": str(error)})
             else:  # the statistic of this run that differs most from those certified
                 ratios = {of.name: of.ratio(len(state.runs)) for of in state.channels if of.later[-1] is not None}
                 most = max(ratios, key=ratios.__getitem__)
                 latest = {"run": name, "distance": state.distances[-1], "statistic": most, "ratio": ratios[most]}
-                judged.append({**latest, "evidence": state.evidence})
+                (seen if state is before else judged).append({**latest, "evidence": state.evidence})
             advance(1)
     for each in judged:
         parts = [f"{each['statistic']} {each['ratio']:.2g} times those certified"]
         if each["distance"] is not None:
             parts.insert(0, f"distance {each['distance']:.4g} {opened.experiment.units}".rstrip())
         out.say(f"{each['run']}: {', '.join(parts)}, evidence of a change {each['evidence']:.2g}")
+    for each in seen:
+        notes.say((f"{each['run']} is not counted", "yellow"), ": it is the recording of an earlier run once more.")
     for failure in skipped:
         notes.say((f"{failure['run']} is not judged", "yellow"), f": {failure['reason']}")
     if not judged:
@@ -92,7 +94,13 @@ def watch(
     if again:
         out.say(f"next: {_next(opened, allowed, store, limit, again[0].number)}")
     repeated = [{"trial": trial.number, "task": trial.parameters} for trial in again]
-    report = {"runs": judged, "skipped": skipped, "again": repeated, "watch": state.to_json(), "store": str(store)}
+    report: dict[str, Any] = {
+        "runs": judged,
+        "skipped": skipped,
+        "counted_before": [each["run"] for each in seen],
+        "again": repeated,
+    }
+    report |= {"watch": state.to_json(), "store": str(store)}
     return report, FALSIFIED if state.expired else 0
 
 

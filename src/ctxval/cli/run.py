@@ -115,7 +115,7 @@ def run(
         if shown is not None:
             shown.end(verdict, bound, report.get("report"))
     _print_result(campaign, report, verdict, bound, trusted)
-    if campaign.failed and not campaign.completed:
+    if campaign.failed and not campaign.completed and not base.status_of(verdict):
         why = "`ctxval why` looks for a cause in what was recorded before the failures."
         err.say(base.ERROR, f"all {len(campaign.failed)} executions failed, so there is no distance. {why}")
         return report, base.CANNOT_GO_ON

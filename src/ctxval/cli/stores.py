@@ -13,6 +13,7 @@ from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.files import MADE_BY, write_text
 from ctxval._util.progress import stage
 from ctxval._util.representation import counted
+from ctxval.campaign.storage import setting_aside
 from ctxval.campaign.storage.other_stores import provenance_of_store
 from ctxval.campaign.storage.recovery import export, recover
 from ctxval.campaign.storage.store import CAUSE, Store
@@ -28,8 +29,10 @@ from ctxval.errors import CtxvalError, InputError, StoreAccessError, StoreError
 
 
 @command()
-def status(store: Path) -> Any:
+def status(store: Path, set_aside: int | None = None) -> Any:
     opened = Store.existing(store)
+    if set_aside is not None:
+        out.say(f"{setting_aside.set_aside(opened, set_aside)}. The history of the store keeps what it held.")
     with opened.snapshot():
         description, trials, changes = opened.description(), Trials(opened.trials()), opened.history()
         thresholds = [asdict(stated) for stated in opened.thresholds() or ()]

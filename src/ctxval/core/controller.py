@@ -65,7 +65,7 @@ class ControllerRun(ShortRepr):
             raise InputError(f"step of a controller must return the pair (u, memory), got {shown(returned)}.")
         u, self._memory = returned
         self._next += 1
-        return np.array(u, dtype=np.float64)  # a copy, because it may be a part of the memory
+        return as_floats("inputs of a controller", u).copy()  # it may be a part of the memory
 
 
 def is_controller(value: object) -> bool:
@@ -122,7 +122,7 @@ class _SeeingController:
 def each_alone(controllers: Sequence[Controller], tasks: Sequence[Task]) -> Feedback:
     """Return controllers of tasks as one of their batch, whose inputs are to the last digit those of each alone."""
     runs = [started(controller, task) for controller, task in zip(controllers, tasks, strict=True)]
-    return lambda t, x: np.stack([np.asarray(run(t, state)) for run, state in zip(runs, x, strict=True)])
+    return lambda t, x: np.stack([as_floats("inputs", run(t, state)) for run, state in zip(runs, x, strict=True)])
 
 
 @runtime_checkable
@@ -293,7 +293,7 @@ class BoundPolicy(ShortRepr):
 
     def __call__(self, t: int, x: Array) -> Array:
         """Return the inputs ``(..., m)`` at step t, within the limits."""
-        u = np.asarray(self.policy(t, x, self.task), dtype=np.float64)
+        u = as_floats("inputs of a policy", self.policy(t, x, self.task))
         return u if self.limits is None else Limits.of(self.limits, u.shape[-1]).clip(u)
 
     def __getitem__(self, index: int) -> BoundPolicy:

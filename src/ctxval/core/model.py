@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from ctxval._util.arrays import Array, rows_of
+from ctxval._util.arrays import Array, as_floats, rows_of
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError, ModelError
@@ -41,18 +41,11 @@ class Function(ShortRepr):
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         if self.vectorized or x.ndim == 1:
-            return _real(self.function(x, u))
+            return as_floats("states of a step", self.function(x, u))
         states, inputs = paired(x, u)
         pairs = zip(rows_of(states), rows_of(inputs), strict=True)
-        rows = [_real(self.function(xi, ui)) for xi, ui in pairs]
+        rows = [as_floats("states of a step", self.function(xi, ui)) for xi, ui in pairs]
         return np.stack(rows).reshape(*states.shape[:-1], -1)
-
-
-def _real(states: object) -> Array:
-    array = np.asarray(states)
-    if np.iscomplexobj(array):  # numpy would drop the imaginary part
-        raise InputError("a step function must return real numbers, got complex ones.")
-    return np.asarray(array, dtype=np.float64)
 
 
 def paired(x: Array, u: Array) -> tuple[Array, Array]:
@@ -87,7 +80,8 @@ def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
             raise ModelError(f"step of the model must return states of shape {np.shape(x)}, got {np.shape(reached)}.")
         return reached
 
-    A, B = jacobian(x, u) if jacobian is not None else central_differences(step, x, u)
+    pair = jacobian(x, u) if jacobian is not None else central_differences(step, x, u)
+    A, B = (as_floats("the model's Jacobian", each) for each in pair)
     if not (np.isfinite(A).all() and np.isfinite(B).all()):
         raise ModelError("the model's Jacobian is not finite along its own trajectory.")
     return A, B

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike
+from ctxval._util.arrays import Array, ArrayLike, as_floats
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller, started
@@ -111,7 +111,7 @@ def _inputs_along(plan: Plan, states: Array) -> Iterator[Array]:
     """Yield the inputs ``(m,)`` that the controller of a plan gives at states ``(H, n)``, each when it is asked for."""
     pi = started(plan.controller, plan.task)
     for t, x in enumerate(states):
-        yield np.asarray(pi(t, x), dtype=np.float64)
+        yield as_floats("inputs of a controller", pi(t, x.copy()))
 
 
 def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ctxval._util.arrays import as_floats
 from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller, started
 from ctxval.core.model import Step
@@ -25,7 +26,7 @@ def rollout(step: Step, controller: Controller, task: Task, *, partial: bool = F
     with np.errstate(all="ignore"):
         x = np.array(task.initial_state)
         pi = started(controller, task)
-        u = np.asarray(pi(0, x), dtype=np.float64)
+        u = as_floats("inputs of a controller", pi(0, x.copy()))
         if u.shape[:-1] != x.shape[:-1] or u.ndim != x.ndim:
             wanted = ", ".join([*map(str, x.shape[:-1]), "m"]) + "," * (x.ndim == 1)
             raise ShapeError(f"the controller must return inputs of shape ({wanted}), got {u.shape}.")
@@ -35,16 +36,16 @@ def rollout(step: Step, controller: Controller, task: Task, *, partial: bool = F
         try:
             for t in range(task.horizon):
                 if t:
-                    u = pi(t, x)
-                # An attribute is looked at first, because other checks take as long as a small step.
-                if getattr(u, "shape", None) != of_inputs and np.shape(u) != of_inputs:
+                    # A controller or a step that works in place may not change what was recorded.
+                    u = as_floats("inputs of a controller", pi(t, x.copy()))
+                if u.shape != of_inputs:
                     wanted = f"inputs of shape {of_inputs} at every step"
-                    raise ShapeError(f"the controller must return {wanted}, got {np.shape(u)}.")
+                    raise ShapeError(f"the controller must return {wanted}, got {u.shape}.")
                 inputs[t] = u
-                x = step(x, inputs[t].copy())  # a step that works in place may not change what was recorded
-                if getattr(x, "shape", None) != of_states and np.shape(x) != of_states:
+                x = as_floats("states of a step", step(x, inputs[t].copy()))
+                if x.shape != of_states:
                     wanted = f"from states of shape {of_states} must return the same shape"
-                    raise ShapeError(f"a step {wanted}, got {np.shape(x)}.")
+                    raise ShapeError(f"a step {wanted}, got {x.shape}.")
                 states[t + 1] = x
         except CtxvalError:
             raise

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, as_finite, as_floats, require_shape
+from ctxval._util.arrays import Array, ArrayLike, as_finite, as_floats, read_only, require_shape
 from ctxval._util.checked import Must, NonNegativeInt, checked
 from ctxval._util.representation import call, named
 from ctxval._util.texts import parted, shortened
@@ -33,16 +33,17 @@ class Parameters:
 
     def __init__(self, space: TaskSpace, points: Array) -> None:
         self._space = space
-        self.points = points
-        """The parameters as rows, shape ``(..., d)``, in the space's own units."""
+        self.points = read_only(points)
+        """The parameters as rows, shape ``(..., d)``, in the space's own units; read-only."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        return self._space.values_of(name, self.points)
+        return self[name]
 
     def __getitem__(self, name: str) -> Any:
-        return self._space.values_of(name, self.points)
+        values = self._space.values_of(name, self.points)
+        return values.copy() if isinstance(values, np.ndarray) else values  # which may be changed
 
     def __repr__(self) -> str:
         if self.points.ndim == 1:
@@ -106,8 +107,7 @@ class TaskSpace:
         self.names: tuple[str, ...] = tuple(names)
         self.dimension = len(names)
         """The number of scalar parameters; the paper writes it as the cardinality of P."""
-        self.low: Array = np.concatenate(lows)
-        self.high: Array = np.concatenate(highs)
+        self.low, self.high = (read_only(np.concatenate(ends)) for ends in (lows, highs))
         self._scalar_units = [shortened(self.units[name]) for name, low in zip(bounds, lows, strict=True) for _ in low]
         labels = zip(names, self._scalar_units, strict=True)
         self.labels = tuple(f"{name} [{unit}]" if unit else name for name, unit in labels)
@@ -309,4 +309,7 @@ def _bounds(name: str, bound: Any) -> tuple[Array, Array, str]:
         raise InputError(f"bounds of {name} must be two numbers or two equally long lists, got {bound!r}.")
     if not (low < high).all():
         raise InputError(f"bounds of {name} must have low < high, got {bound!r}.")
+    with np.errstate(over="ignore"):
+        if not np.isfinite(high - low).all():
+            raise InputError(f"bounds of {name} must have a finite range high - low, got {bound!r}.")
     return low, high, unit

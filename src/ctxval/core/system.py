@@ -9,7 +9,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ctxval._util.arrays import Array, rows_of
+from ctxval._util.arrays import Array, as_floats, rows_of
+from ctxval._util.checked import require
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller, seeing
@@ -33,7 +34,7 @@ class Outputs(ShortRepr):
         if callable(given):
             self.function: OutputsLike = given
         else:
-            self.function = [int(i) for i in given]
+            self.function = [int(i) for i in require("outputs", Sequence[int], given)]
             if not self.function or len(set(self.function)) < len(self.function) or min(self.function) < 0:
                 raise InputError(f"outputs must be a function h(x), or different indices of states, got {given!r}.")
         self._batched: bool | None = None
@@ -61,16 +62,16 @@ class Outputs(ShortRepr):
             # Whether the function returns for a batch what it returns for its first and last state alone.
             ends, self._batched = [self._of_one(row) for row in (rows[0], rows[-1])], False
             with suppress(Exception):  # the user's function, which may take one state only
-                y = np.asarray(self.function(x), dtype=np.float64)
+                y = as_floats("outputs", self.function(x))
                 if y.shape == (*x.shape[:-1], *ends[0].shape):
                     self._batched = bool(np.allclose(rows_of(y)[[0, -1]], ends, rtol=1e-9, atol=0, equal_nan=True))
         if self._batched:
-            return np.asarray(self.function(x), dtype=np.float64)
+            return as_floats("outputs", self.function(x))
         return np.stack([self._of_one(row) for row in rows]).reshape(*x.shape[:-1], -1)
 
     def _of_one(self, x: Array) -> Array:
         assert callable(self.function)
-        y = np.asarray(self.function(x), dtype=np.float64)
+        y = as_floats("outputs", self.function(x))
         if y.ndim != 1 or not y.size:
             raise ShapeError(f"outputs of one state must have shape (p,), got {y.shape} for a state {x.shape}.")
         return y

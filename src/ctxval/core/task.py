@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, as_finite, as_floats
+from ctxval._util.arrays import Array, as_finite, as_floats, read_only
 from ctxval._util.checked import PositiveInt, Seconds, checked
 from ctxval._util.representation import call
 from ctxval.errors import InputError, ShapeError
@@ -51,7 +51,7 @@ class Task:
         if goal is not None:
             target = _components("goal", goal)[..., None, :]
         elif reference is not None:
-            target = as_floats("reference", reference)
+            target = read_only(as_floats("reference", reference))
             if target.ndim < 2 or target.shape[-2] != self.horizon + 1:
                 raise ShapeError(f"reference must have shape (..., {self.horizon + 1}, {n}), got {target.shape}.")
         else:
@@ -149,7 +149,7 @@ def _components(name: str, value: Any) -> Array:
         except ValueError:
             shapes = [part.shape for part in parts]
             raise ShapeError(f"the components of {name} must have the same batch shape, got {shapes}.") from None
-    array = as_floats(name, value)
+    array = read_only(as_floats(name, value))
     if array.ndim == 0 or array.size == 0:
         raise ShapeError(f"{name} must be a list of components or an array (..., n), got {value!r}.")
     return array

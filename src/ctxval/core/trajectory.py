@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, Rows, as_floats, held_means, rows_of
+from ctxval._util.arrays import Array, Mask, Rows, as_floats, held_means, read_only, rows_of
 from ctxval._util.columns import (
     EPISODES,
     FAR,
@@ -110,6 +110,10 @@ class Trajectory:
     def copy(self) -> Trajectory:
         """Return the same trajectory with arrays of its own, which may be changed."""
         return Trajectory(self.times.copy(), self.states.copy(), self.inputs.copy(), self.ended)
+
+    def frozen(self) -> Trajectory:
+        """Return the same trajectory with arrays that cannot be changed."""
+        return Trajectory(read_only(self.times), read_only(self.states), read_only(self.inputs), self.ended)
 
     def __getitem__(self, index: int) -> Trajectory:
         """Return one trajectory of the batch; the batch's ``ended`` applies to trajectories that are not finite."""

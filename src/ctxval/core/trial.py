@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, read_only
 from ctxval._util.representation import ShortRepr, call, counted, line, lines, table
 from ctxval.core.space import Point
 
@@ -52,6 +52,9 @@ class Trial:
     note: dict[str, Any] | None = None
     #: what was changed on the system since an earlier trial of the same task that had another result
     because: str | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "unit_point", read_only(self.unit_point))
 
     @property
     def told(self) -> bool:

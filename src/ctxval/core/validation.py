@@ -173,7 +173,7 @@ class Validation:
             where = self.space.describe_point(parameters.points)
             ended = f"the model's closed loop {plan.model_trajectory.ended} for the task {where}"
             raise ModelError(f"{ended}: repair the model, or restrict the task space to tasks that it can perform.")
-        return plan
+        return replace(plan, model_trajectory=plan.model_trajectory.frozen())
 
     def execute(self, plan: Plan) -> Trajectory:
         """Execute S once."""
@@ -279,10 +279,8 @@ class Validation:
         """
         try:
             with np.errstate(all="ignore"):  # some distances change the arrays that they are given
-                values = np.asarray(self.distance(model.copy(), system.copy(), task))
-                if np.iscomplexobj(values):
-                    raise TypeError(f"it must be a real number, got {values}")
-                return np.asarray(values, dtype=np.float64)
+                values = as_floats("a distance", self.distance(model.copy(), system.copy(), task))
+                return np.asarray(values + 0.0)  # -0.0 is 0.0
         except BaseException as error:
             if raised_by_signal(error):
                 raise

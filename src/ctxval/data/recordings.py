@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.arrays import Array, Mask, Rows, as_floats
 from ctxval._util.columns import FAR, conversion, sentinels, time_column, unit_advice
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
@@ -354,7 +354,7 @@ class Recorded:
         times, states, inputs = run.times[: steps + 1], run.states[: steps + 1], run.inputs[:steps]
         if not inputs.shape[-1]:
             pi = started(controller, task)
-            inputs = np.stack([np.asarray(pi(t, x), dtype=np.float64) for t, x in enumerate(states[:-1])])
+            inputs = np.stack([as_floats("inputs of a controller", pi(t, x.copy())) for t, x in enumerate(states[:-1])])
         return Trajectory(times, states, inputs)
 
     def __repr__(self) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, as_floats
 from ctxval.core.controller import Controller, started
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
@@ -25,13 +25,13 @@ def run_episode(advance: Advance, controller: Controller, task: Task, inputs: in
     states, applied = np.full((task.horizon + 1, len(x)), np.nan), np.full((task.horizon, inputs), np.nan)
     states[0] = x
     for t in range(task.horizon):
-        u = np.asarray(pi(t, x), dtype=np.float64)
+        u = as_floats("inputs of a controller", pi(t, x.copy()))
         if u.shape != (inputs,):
             wanted = f"the system's {inputs} inputs, shape ({inputs},)"
             raise ShapeError(f"the controller must return {wanted}, got {u.shape}.")
         applied[t] = u
         x, reason = advance(u) if np.isfinite(u).all() else (np.full_like(x, np.nan), "an input is not finite")
-        states[t + 1] = x
+        states[t + 1] = x = as_floats("states of the system", x)
         if not np.isfinite(x).all():
             reason = reason or "the state is not finite"
         elif t + 1 == task.horizon:

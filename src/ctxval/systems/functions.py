@@ -115,8 +115,9 @@ class Imperfect:
         seed: int | None = None,
     ) -> None:
         self.model = as_model(step, vectorized=vectorized)
-        self.start, self.process = np.asarray(start, dtype=np.float64), np.asarray(process, dtype=np.float64)
-        self.measurement, self.resolution = (np.asarray(value, dtype=np.float64) for value in (measurement, resolution))
+        self.start, self.process = as_floats("start", start), as_floats("process", process)
+        self.measurement = as_floats("measurement", measurement)
+        self.resolution = as_floats("resolution", resolution)
         for name in ("start", "process", "measurement", "resolution"):
             if not (np.isfinite(getattr(self, name)) & (getattr(self, name) >= 0)).all():
                 raise InputError(f"{name} must be finite and not negative, got {getattr(self, name).tolist()}.")

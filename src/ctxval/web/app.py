@@ -10,7 +10,6 @@ import tempfile
 import zipfile
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from python_multipart.exceptions import FormParserError
@@ -23,7 +22,7 @@ from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from ctxval._util.checked import NonNegativeFloat, require
-from ctxval._util.texts import shortened, visible
+from ctxval._util.texts import Number, number_in, shortened, visible
 from ctxval.campaign.telling import SuppliedResult
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TASK, TaskSuite
@@ -40,7 +39,6 @@ _OUT_OF_DATE = (
 
 Handler = Callable[[Request, str], Awaitable[Response]]
 
-Number = TypeVar("Number", int, float)
 
 Fields = Mapping[str, str]  #: the fields of a form that are texts
 
@@ -283,10 +281,10 @@ def _number(fields: Fields, field: str, name: str) -> float:
     return _read(fields, field, f"{name} must be a number", float)
 
 
-def _read(fields: Fields, field: str, sentence: str, kind: Callable[[str], Number]) -> Number:
+def _read(fields: Fields, field: str, sentence: str, kind: type[Number]) -> Number:
     given = fields.get(field, "").strip()
     with contextlib.suppress(ValueError, OverflowError):  # a whole number may be too large for a float
-        value = kind(given)
+        value = number_in(given, kind)
         if math.isfinite(value):
             return value
     raise InputError(f"{sentence}, got {given[:60]!r}.")

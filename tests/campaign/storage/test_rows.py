@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,9 @@ WHOLE = Trial(
 
 def read(row: tuple[Any, ...]) -> Trial | None:
     """Read a row of which the checksum fits, as anybody can compute one."""
-    return read_trial(row, checksum_of(row))
+    with suppress(InputError):
+        return read_trial(row, checksum_of(row))
+    return None
 
 
 def changed(**values: Any) -> tuple[Any, ...]:
@@ -112,8 +115,9 @@ def test_a_row_that_no_trial_has_is_damaged(values: dict[str, Any]) -> None:
 
 def test_a_row_needs_its_checksum() -> None:
     row = row_of(WHOLE)
-    assert read_trial(row, None) is None
-    assert read_trial(row, checksum_of(row) + 1) is None
+    for checksum in (None, checksum_of(row) + 1):
+        with pytest.raises(InputError):
+            read_trial(row, checksum)
 
 
 ANYTHING = st.one_of(

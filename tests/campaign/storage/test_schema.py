@@ -162,7 +162,7 @@ def test_crafted_rows_are_one_sentence_and_export_saves_the_rest(store: Path, tm
 
 def test_a_text_that_is_not_utf_8_is_one_sentence(store: Path) -> None:
     edit(store, "UPDATE trials SET failure = CAST(x'80ff' AS TEXT) WHERE number = 4")
-    assert "store" in said(store)
+    assert "its trial 4 cannot be read" in said(store)
     assert len(recover(store).trials) == 4
 
 

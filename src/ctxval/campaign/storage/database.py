@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sqlite3
 import time
 import warnings
@@ -21,12 +22,12 @@ class Database:
     """A SQLite file with the tables of a store, made if it is new; its path is absolute, None in memory."""
 
     def __init__(self, path: str | Path | None = None) -> None:
-        # Absolute, because an executed system may change the current folder of the process.
-        self.path = None if path is None else Path(path).absolute()
         self.name = "the store in memory" if path is None else str(path)
         self._lock: FileLock | None = None
         self._locked = False
         with self._translated_errors():
+            # Absolute, because an executed system may change the current folder of the process.
+            self.path = None if path is None else Path(path).absolute()
             if self.path is not None:
                 make_folder(self.path.parent)
                 if kind := network(self.path):
@@ -149,6 +150,13 @@ class Database:
 
     def _damaged(self, what: str) -> ForeignStoreError:
         return ForeignStoreError(f"{self.name} is damaged: {what}; `ctxval export` saves what is readable.")
+
+    def _unreadable(self, number: int, what: str) -> ForeignStoreError:
+        store = shlex.quote(self.name)
+        advice = f"`ctxval status {store} --set-aside {number}` sets this trial aside, so that the others are usable"
+        return ForeignStoreError(
+            f"{self.name} is damaged: {what}; {advice}, and `ctxval export` saves what is readable."
+        )
 
 
 def _acquire(lock: FileLock, wait: float) -> None:

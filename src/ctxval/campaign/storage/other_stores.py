@@ -65,7 +65,4 @@ def _read(path: Path) -> tuple[dict[str, Any], Trial | None]:
     experiment = {str(key): json.loads(value) for key, value in rows}
     if not isinstance(experiment.get("validation"), dict) or not executed:
         raise ValueError(f"{path} has no executed trials of an experiment")
-    worst = None if row is None else read_trial(row[:-1], row[-1])
-    if row is not None and worst is None:
-        raise ValueError(f"the worst trial of {path} cannot be read")
-    return experiment, worst
+    return experiment, None if row is None else read_trial(row[:-1], row[-1])

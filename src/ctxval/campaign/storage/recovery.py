@@ -17,7 +17,7 @@ from ctxval._util.describe import describe
 from ctxval._util.files import MADE_BY, temporary_folder, write_text, written_whole
 from ctxval._util.texts import guarded, shortened, visible
 from ctxval.campaign.storage import schema
-from ctxval.campaign.storage.rows import COLUMNS, Side, checksum_of, read_json, read_trajectory, read_trial
+from ctxval.campaign.storage.rows import COLUMNS, Side, read_json, read_trajectory, read_trial
 from ctxval.campaign.storage.store import Store
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
@@ -109,12 +109,11 @@ def _read(connection: sqlite3.Connection, tables: dict[str, set[str]], size: int
             continue
         for row in _rows(connection, table, names, size, recovered):
             if table == "trials":
-                if (trial := read_trial(row[:-1], row[-1])) is not None:
+                try:
+                    trial = read_trial(row[:-1], row[-1])
                     recovered.trials.setdefault(trial.number, trial)
-                else:
-                    fits = checksum_of(row[:-1]) == row[-1]
-                    why = "it holds what no trial can" if fits else "its checksum does not fit"
-                    recovered.note(f"trial {row[0]}: {why}")
+                except InputError as error:
+                    recovered.note(f"trial {row[0]}: {error}")
             elif table == "trajectories":
                 number, side, npz, checksum = row
                 name = f"the {side}'s trajectory of trial {number}"

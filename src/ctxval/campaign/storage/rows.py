@@ -6,10 +6,14 @@ import json
 import sys
 import zlib
 from dataclasses import replace
+from operator import index
 from typing import Any, Literal, NoReturn, get_args
 
 import numpy as np
 
+from ctxval._util.arrays import as_floats
+from ctxval._util.refusals import reworded
+from ctxval._util.texts import shortened, text_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Origin, State, Trial
 from ctxval.errors import InputError
@@ -21,14 +25,37 @@ Side = Literal["model", "system"]  #: whose trajectory it is
 
 
 def row_of(trial: Trial) -> tuple[Any, ...]:
-    """Return a trial as the values of its columns."""
-    # SQLite returns floats, which the checksum must be of.
-    distance, seconds = (None if value is None else float(value) for value in (trial.distance, trial.seconds))
-    return (
-        *(trial.number, trial.origin, trial.state, json.dumps(trial.unit_point.tolist())),
-        *(json.dumps(trial.parameters), trial.attempts, int(trial.executed)),
-        *(distance, trial.failure, seconds, json.dumps(trial.note), trial.because),
-    )
+    """Return a trial as the values that SQLite returns of its columns. Raises an InputError if no row can hold it."""
+    with reworded(f"trial {trial.number} cannot be stored", TypeError, ValueError, OverflowError, InputError):
+        # -0.0 + 0.0 is 0.0, as SQLite stores it.
+        distance, seconds = (None if value is None else float(value) + 0.0 for value in (trial.distance, trial.seconds))
+        failure, because = (None if text is None else text_of(text) for text in (trial.failure, trial.because))
+        row = (
+            *(
+                int(index(trial.number)),
+                str(trial.origin),
+                str(trial.state),
+                as_json(as_floats("unit_point", trial.unit_point)),
+            ),
+            *(as_json(trial.parameters), int(index(trial.attempts)), int(trial.executed)),
+            *(distance, failure, seconds, as_json(trial.note), because),
+        )
+        read_trial(row, checksum_of(row))
+    return row
+
+
+def as_json(value: Any) -> str:
+    """Return the JSON text of a value, which :func:`read_json` reads; arrays and scalars of numpy become plain."""
+
+    def plain(item: Any) -> Any:
+        if isinstance(item, np.generic | np.ndarray):
+            return item.tolist()
+        raise TypeError(f"{type(item).__name__} cannot be written as JSON")
+
+    with reworded("a value has no JSON text", TypeError, ValueError, RecursionError):
+        text = json.dumps(value, default=plain)
+    read_json(text, finite=False)
+    return text
 
 
 def checksum_of(row: tuple[Any, ...]) -> int:
@@ -36,31 +63,43 @@ def checksum_of(row: tuple[Any, ...]) -> int:
     return zlib.crc32(repr(row).encode("utf-8", "backslashreplace"))
 
 
-def read_trial(row: tuple[Any, ...], checksum: Any) -> Trial | None:
-    """Return the trial of a row; None if the row is damaged, or if its values are not those of a trial."""
+def read_trial(row: tuple[Any, ...], checksum: Any) -> Trial:
+    """Return the trial of a row. Raises an InputError if the row is damaged or its values are not those of a trial."""
     number, origin, state, point, names, attempts, executed, distance, failure, seconds, note, because = row
     if checksum_of(row) != checksum:
-        return None
-    try:
-        unit_point, parameters, notes = read_json(point), read_json(names), read_json(note or "null", finite=False)
-    except InputError:
-        return None
-    valid = (
-        all(isinstance(count, int) and 0 <= count < 2**53 for count in (number, attempts)) and executed in (0, 1),
-        state in get_args(State) and origin in get_args(Origin),
-        _numbers(unit_point) and all(0 <= value <= 1 for value in unit_point),
-        isinstance(parameters, dict)
-        and all(isinstance(v, str) or _number(v) or _numbers(v) for v in parameters.values()),
-        all(value is None or (isinstance(value, float) and 0 <= value < np.inf) for value in (distance, seconds)),
-        (state == "completed") == (distance is not None),
-        executed if state == "unmeasured" else state != "open" or not executed,
-        isinstance(failure, str | None) and isinstance(notes, dict | None) and isinstance(because, str | None),
+        raise InputError("its checksum does not fit")
+    unit_point, parameters, notes = read_json(point), read_json(names), read_json(note or "null", finite=False)
+    values = parameters.values() if isinstance(parameters, dict) else [None]
+    measured = state == "completed"
+    rules = (
+        ("number", "an integer >= 0", _count(number)),
+        ("attempts", "an integer >= 0", _count(attempts)),
+        ("executed", "0 or 1", executed in (0, 1)),
+        ("state", f"one of {', '.join(get_args(State))}", state in get_args(State)),
+        ("origin", f"one of {', '.join(get_args(Origin))}", origin in get_args(Origin)),
+        ("unit_point", "numbers from 0 to 1", _numbers(unit_point) and all(0 <= value <= 1 for value in unit_point)),
+        ("parameters", "finite numbers or texts", all(isinstance(v, str) or _number(v) or _numbers(v) for v in values)),
+        ("distance", "a finite number >= 0", _size(distance) if measured else distance is None),
+        ("seconds", "a finite number >= 0", seconds is None or _size(seconds)),
+        ("executed", "that of its state", executed if state == "unmeasured" else state != "open" or not executed),
+        *((name, "a text", isinstance(t, str | None)) for name, t in (("failure", failure), ("because", because))),
+        ("note", "a table", isinstance(notes, dict | None)),
     )
-    if not all(valid):
-        return None
+    for name, wanted, holds in rules:
+        if not holds:
+            got = shortened(repr(dict(zip(COLUMNS.split(", "), row, strict=True))[name]), 100)
+            raise InputError(f"its {name} must be {wanted}, got {got}")
     where = np.array(unit_point, dtype=np.float64)
     known = Trial(number, origin, state, where, parameters, attempts, bool(executed), note=notes, because=because)
     return replace(known, distance=distance, failure=failure, seconds=seconds)
+
+
+def _count(value: Any) -> bool:
+    return isinstance(value, int) and 0 <= value < 2**53
+
+
+def _size(value: Any) -> bool:
+    return isinstance(value, float) and 0 <= value < np.inf
 
 
 def _number(value: Any) -> bool:
@@ -103,10 +142,20 @@ MOST_CHARACTERS = 2**24  # largest number of characters of a key, and of the JSO
 
 def pair_of(key: str, value: Any) -> tuple[str, str]:
     """Return a key and its value as the row of a table."""
-    text = json.dumps(value)
+    with reworded(f"{key} cannot be stored", InputError):
+        text = as_json(value)
     if len(text) > MOST_CHARACTERS:
         raise InputError(f"{key} must have at most {MOST_CHARACTERS} characters as JSON to be stored, got {len(text)}.")
     return key, text
+
+
+def trajectory_row(number: int, side: str, trajectory: Trajectory) -> tuple[int, str, bytes, int]:
+    """Return a trajectory as the row of a table. Raises an InputError if it cannot be read back."""
+    npz = trajectory.to_npz()
+    row = (number, side, npz, checksum_of((number, side, npz)))
+    if read_trajectory(*row) is None:
+        raise InputError(f"the {side}'s trajectory of trial {number} cannot be stored: it is too large to be read.")
+    return row
 
 
 def read_trajectory(number: int, side: str, npz: Any, checksum: Any) -> Trajectory | None:

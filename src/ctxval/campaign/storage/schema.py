@@ -87,6 +87,8 @@ class Guarded(sqlite3.Connection):
         self.set_progress_handler(too_many, 10_000)
         for limit, value in _LIMITS.items():
             self.setlimit(limit, value)
+        # Damaged bytes of a text must not prevent that other rows are read: the checksum of their row does not fit.
+        self.text_factory = lambda text: text.decode("utf-8", "backslashreplace")
         self.execute("PRAGMA trusted_schema = OFF")
         self.execute("PRAGMA cell_size_check = ON")
 

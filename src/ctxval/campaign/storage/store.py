@@ -12,8 +12,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ctxval._util.checked import checked
+from ctxval._util.checked import PositiveFloat, checked, require
 from ctxval._util.representation import Shown, call
+from ctxval._util.texts import text_of
 from ctxval._util.version import VERSION
 from ctxval.campaign.storage import rows, schema
 from ctxval.campaign.storage.database import Database, now
@@ -121,6 +122,7 @@ class Store(Database):
 
         A store without thresholds is one that no campaign has described, and stays as it is.
         """
+        require("threshold", PositiveFloat, threshold)
         if any(each.threshold == threshold for each in self.thresholds() or ()):
             return
         with self._transaction():
@@ -133,7 +135,7 @@ class Store(Database):
 
     def keep_settings(self, settings: dict[str, Any]) -> None:
         """Store the settings that make the experiment again, for commands that get only the store."""
-        if self.settings() != json.loads(json.dumps(settings)):
+        if self.settings() != json.loads(rows.as_json(settings)):
             with self._transaction():
                 self._execute("DELETE FROM settings")
                 self._insert_pairs("settings", settings)
@@ -165,13 +167,16 @@ class Store(Database):
         """Return the later changes of the store in order, each with its reason."""
         with self._rows("SELECT what, why, content, at FROM history ORDER BY number") as changes:
             try:
-                return [Change(str(what), str(why), rows.read_json(text), str(at)) for what, why, text, at in changes]
+                return [
+                    Change(str(what), str(why), rows.read_json(text, finite=False), str(at))
+                    for what, why, text, at in changes
+                ]
             except InputError as error:
                 raise self._damaged("its history cannot be read") from error
 
     def _insert_change(self, change: Change) -> None:
         statement = "INSERT INTO history (at, what, why, content) VALUES (?, ?, ?, ?)"
-        self._execute(statement, (now(), change.what, change.why, json.dumps(change.content)))
+        self._execute(statement, (now(), *map(text_of, (change.what, change.why)), rows.as_json(change.content)))
 
     def remeasure(
         self, trials: Sequence[Trial], description: dict[str, Any], change: Change, seen: tuple[int, int, int]
@@ -214,6 +219,7 @@ class Store(Database):
                 places = ", ".join("?" * len(values))
                 columns = f"{COLUMNS}, checksum, opened_at, closed_at"
                 self._execute(f"INSERT INTO trials ({columns}) VALUES ({places})", values)
+                self._read_back(row)
                 self._write_trajectory(trial.number, "model", model_trajectory)
                 self._write_trajectory(trial.number, "system", system_trajectory)
 
@@ -251,22 +257,35 @@ class Store(Database):
     def _update(self, trial: Trial, where: str = "", closed_at: str | None = None) -> None:
         """Store what an execution changes in a trial, which must satisfy a further condition."""
         columns = ("attempts", "state", "distance", "failure", "executed", "seconds", "note")
-        row = dict(zip(COLUMNS.split(", "), row_of(trial), strict=True))
-        values = (*(row[name] for name in columns), checksum_of(row_of(trial)), closed_at, trial.number)
+        whole = row_of(trial)
+        row = dict(zip(COLUMNS.split(", "), whole, strict=True))
+        values = (*(row[name] for name in columns), checksum_of(whole), closed_at, trial.number)
         assignments = f"{' = ?, '.join(columns)} = ?, checksum = ?, closed_at = coalesce(?, closed_at)"
         if self._execute(f"UPDATE trials SET {assignments} WHERE number = ? {where}", values).rowcount != 1:
             row = self._execute("SELECT state FROM trials WHERE number = ?", (trial.number,)).fetchone()
             state = "not open" if row is None else "being executed by another process" if row[0] == "open" else row[0]
             raise InputError(f"trial {trial.number} is {state}, so nothing more can be told of it.")
+        self._read_back(whole)
+
+    def _read_back(self, row: tuple[Any, ...]) -> None:
+        """Check, before the transaction is committed, that SQLite returns a trial as it was written."""
+        read = self._execute(f"SELECT {COLUMNS} FROM trials WHERE number = ?", row[:1]).fetchone()
+        if repr(read) != repr(row):
+            raise InputError(f"trial {row[0]} is not stored: another task, or other values, would be read back.")
 
     def trials(self) -> list[Trial]:
         """Return all trials in their order. Raises a :class:`ForeignStoreError` if one is damaged."""
         trials: list[Trial] = []
         with self._rows(f"SELECT {COLUMNS}, checksum FROM trials ORDER BY number") as cursor:
             for *row, checksum in cursor:
-                trial = read_trial(tuple(row), checksum)
-                if trial is None or not rows.follows(trial, trials):
-                    raise self._damaged(f"its trial {len(trials)} cannot be read")
+                try:
+                    trial = read_trial(tuple(row), checksum)
+                except InputError as error:
+                    raise self._unreadable(
+                        len(trials), f"its trial {len(trials)} cannot be read, because {error}"
+                    ) from error
+                if not rows.follows(trial, trials):
+                    raise self._damaged(f"its trial {len(trials)} is missing, or is that of another task space")
                 trials.append(trial)
         return trials
 
@@ -359,15 +378,14 @@ class Store(Database):
                 return None, None
         trajectory = None if row is None else read_trajectory(number, side, *row)
         if trajectory is None:
-            raise self._damaged(f"the {side}'s trajectory of its trial {number} cannot be read")
+            raise self._unreadable(number, f"the {side}'s trajectory of its trial {number} cannot be read")
         return int(row[1]), trajectory
 
     def _write_trajectory(self, number: int, side: Side, trajectory: Trajectory | None) -> None:
         if side == "system":
             self._memory += _size(self._kept.pop(number, (None, None))[1])
         if trajectory is not None:
-            npz = trajectory.to_npz()
-            values = (number, side, npz, checksum_of((number, side, npz)))
+            values = rows.trajectory_row(number, side, trajectory)
             self._execute("INSERT INTO trajectories (trial, side, npz, checksum) VALUES (?, ?, ?, ?)", values)
 
     def __repr__(self) -> str:

@@ -305,6 +305,12 @@ def conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def whole_suite_statement(trusted: int, tasks: int, threshold: float, units: str) -> str:
+    """Return what the envelope of a suite says whose tasks were all executed."""
+    limit = f"{at_most(threshold)} {units}".rstrip()
+    return f"All {tasks} tasks of the suite were executed, and d stays below {limit} on {trusted or 'none'} of them."
+
+
 def envelope_statement(envelope: Envelope) -> str:
     """Return what an envelope says, why it is not larger, and what nothing has checked."""
     limit = f"{at_most(envelope.threshold)} {envelope.units}".rstrip()

@@ -126,6 +126,7 @@ BARE_CORNERS = (
 ACCEPTED = "what was changed after {trials} trials makes no difference to them: {why!r} ({differences})"
 MEASURED_ANEW = "the distances are those measured anew: {why!r}"
 REPLACED = "the result of trial {numbers} that was told first is wrong: {why!r}"
+SET_ASIDE = "the trial that could not be read would not change this: {why}"
 REFINED = (
     "the model was learned again from executions of earlier models: these are data of the model and no trials of it, "
     "so only executions under its own controllers are counted"

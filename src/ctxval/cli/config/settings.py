@@ -128,7 +128,7 @@ class ExperimentSettings(BaseModel, extra="forbid"):
     states: dict[str, str] = Field(default_factory=dict)
     inputs: dict[str, str] = Field(default_factory=dict)
     units: str | None = None
-    budget: int | None = Field(default=None, ge=1)
+    budget: int | None = Field(default=None, ge=1, strict=True)
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
     longest: int | None = Field(default=None, ge=1, strict=True)
     start_tolerance: float | None = Field(default=None, ge=0, allow_inf_nan=False)
@@ -138,7 +138,7 @@ class ExperimentSettings(BaseModel, extra="forbid"):
     within: float = Field(default=WITHIN, gt=0, allow_inf_nan=False, strict=True)
     confidence: float = Field(default=CONFIDENCE, ge=LEAST_CONFIDENCE, lt=1, strict=True)
     certificate: CertificateTable = Field(default_factory=CertificateTable)
-    seed: int = Field(default=0, ge=0)
+    seed: int = Field(default=0, ge=0, strict=True)
     store: Path | None = None
     search: SearchTable = Field(default_factory=SearchTable)
     aspect1: Aspect1Table = Field(default_factory=Aspect1Table)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.arrays import Array, Mask, Rows, as_floats
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
@@ -116,7 +116,7 @@ def stepped(model: Model, x: Array, u: Array) -> Array:
     """Return the next states of a model, ``(N, n)``."""
     try:
         with np.errstate(all="ignore"):
-            x_next = np.asarray(model.step(x, u), dtype=np.float64)
+            x_next = as_floats("states of a step", model.step(x, u))
         if x_next.shape != x.shape:
             raise ModelError(f"it returned the shape {x_next.shape}")
     except (Exception, SystemExit) as error:  # the user's model
