@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,7 +13,8 @@ from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
-from ctxval.studies.causes.cause import CauseCandidate, Repaired
+from ctxval.studies.causes.cause import Cause, CauseCandidate, Repaired
+from ctxval.studies.causes.flow import Linearisation
 
 STEPS = (1, 6)  # of the predictions
 _LARGEST = 1e3  # of a residual, as a multiple of the typical one of M
@@ -80,12 +82,22 @@ class Evidence:
         inputs = self.inputs.reshape(-1, self.inputs.shape[-1])
         return self.states[window.states], inputs[window.inputs], residuals
 
+    @functools.cached_property
+    def linearised(self) -> Linearisation:
+        """M at all recorded states."""
+        rows = [np.arange(horizon + 1) + k * self.inputs.shape[1] for k, horizon in enumerate(self.horizons)]
+        inputs = self.inputs.reshape(-1, self.inputs.shape[-1])
+        with np.errstate(all="ignore"):
+            return Linearisation.of(self.model, self.states, inputs[np.minimum(np.concatenate(rows), len(inputs) - 1)])
+
     def left_by(self, repaired: Repaired, window: Predictions, moved: Array | float = 0.0) -> Array:
         """Return predicted minus recorded states ``(N, n)``; predictions begin at recorded states that are moved."""
         acting = repaired.acting(self.inputs).reshape(-1, self.inputs.shape[-1])
         x = repaired.true(self.states[window.states] + moved)
+        moved_back = any(type(cause).true is not Cause.true for cause in repaired.causes)
         for k in range(window.steps):
-            x = repaired.reached(x, acting[window.inputs + k])
+            at = None if moved_back else self.linearised[window.states + k]
+            x = repaired.reached(x, acting[window.inputs + k], at)
         return np.asarray(repaired.recorded(x) - self.states[window.states + window.steps])
 
     def noise(self, repaired: Repaired) -> Array:

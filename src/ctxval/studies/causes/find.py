@@ -348,7 +348,7 @@ def candidates(plant: Plant, x: Array, u: Array, residuals: Array, *, outputs: b
         *signals.of_inputs(plant),
         *(candidate for joint in plant.ports for candidate in mechanics.forces(plant, joint, x, u, missed)),
         *(mechanics.of_mujoco(plant, missed) if isinstance(plant.model, MuJoCo) else mechanics.of_joints(plant)),
-        of_size(mechanics.TimeStep((1.0,)), 0.2, 5.0, 0.1, 0.95, 1.05),
+        of_size(mechanics.TimeStep((1.0,)), 0.2, 5.0, 0.1, 0.5, 0.95, 1.05, 2.0),
         *(() if outputs else signals.of_sensors(plant, x)),  # states that are estimated have no sensors
     )
 
