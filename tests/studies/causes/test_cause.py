@@ -143,16 +143,6 @@ def test_what_an_input_of_1_does(cause: Cause, expected: list[float]) -> None:
     np.testing.assert_allclose(Repaired(MODEL, (cause,)).step(np.zeros(2), np.ones(1)), expected)
 
 
-def test_gravity_scales_what_pulls_at_rest_alone() -> None:
-    def step(x: Array, u: Array) -> Array:
-        return x + DT * np.stack([x[..., 1], u[..., 0] - 3.0 * x[..., 0] - 0.5 * x[..., 1]], axis=-1)
-
-    joint = Joint(rate=1, position=0, share=0.0)
-    heavier = Repaired(models.Function(step, vectorized=True), (causes.Gravity((1.5,), (joint,), (1,), DT),))
-    x, u = np.array([0.2, 0.7]), np.array([0.4])
-    np.testing.assert_allclose(heavier.step(x, u) - step(x, u), [0.0, -0.5 * 3.0 * 0.2 * DT], atol=1e-12)
-
-
 def test_the_lines_of_python_make_the_same_cause() -> None:
     for cause in (causes.Coulomb((0.4,), **FORCE), causes.Delay((1.25,)), causes.InputGain((0.5,), None)):
         assert eval(cause.python(), {"causes": causes}) == cause

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.learning.actuators import Actuator
 from ctxval.studies.causes.cause import Cause, CauseCandidate, Plant, of_ratio, of_size
+from ctxval.systems.actuator import Actuator
 
 
 def _at(values: Array, index: int | list[int] | None, size: float, elsewhere: float = 0.0) -> Array:
@@ -145,9 +145,7 @@ class Delay(Cause):
     remembers: ClassVar[bool] = True
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        actuator = Actuator(delay=max(self.sizes[0], 0.0))
-        commanded = (u, *(memory or ()))[: actuator.remembered]
-        return actuator.follow(np.zeros_like(u), commanded), commanded
+        return Actuator(delay=max(self.sizes[0], 0.0)).follow(u, memory)
 
     def text(self, plant: Plant) -> str:
         return f"commands arrive {_duration(plant.dt * self.sizes[0])} late ({self.sizes[0]:.3g} steps)"
@@ -161,10 +159,7 @@ class Lag(Cause):
     remembers: ClassVar[bool] = True
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        lag = max(self.sizes[0], 1e-3)
-        left = (np.zeros_like(u) if memory is None else memory) - u
-        # What acts is the mean over the step of an input that approaches the command.
-        return u + left * lag * (1 - np.exp(-1 / lag)), u + left * np.exp(-1 / lag)
+        return Actuator(lag=max(self.sizes[0], 1e-3)).follow(u, memory)
 
     def text(self, plant: Plant) -> str:
         return f"the actuators follow with a time constant of {_duration(plant.dt * self.sizes[0])}"
