@@ -21,36 +21,36 @@ class Actuator:
     #: time constant in steps of the first-order lag with which delayed inputs are followed; 0 if there is none
     lag: float = 0.0
 
-    def follow(self, u: Array, memory: Any = None) -> tuple[Array, Any]:
+    def follow(self, u: Array, memory: Any = None, parts: int = 1) -> tuple[Array, Any]:
         """Return the inputs that act ``(..., m)`` for those that are commanded, and a memory; None at the first step.
 
-        The memory has the latest commands, the latest first, and what the lag has reached when the step ends.
+        With parts, they are the means over these parts of the step, ``(..., parts, m)``. The memory has the latest
+        commands, the latest first, and what the lag has reached when the step ends.
         """
         commanded, reached = ((), np.zeros_like(u)) if memory is None else memory
         commanded = (u, *commanded)[: int(self.delay) + 2]
-        parts = (weight * commanded[back] for weight, back in self._parts if back < len(commanded))
-        acting, reached = self._followed(reached, sum(parts, np.zeros_like(u)))
-        return acting, (commanded, reached)
+        newer, older = ((*commanded, *[np.zeros_like(u)] * (int(self.delay) + 2))[int(self.delay) + k] for k in (0, 1))
+        acting = []
+        for weight in np.clip(np.arange(1, parts + 1) - parts * (self.delay % 1.0), 0.0, 1.0):
+            mean, reached = self._followed(reached, weight * newer + (1 - weight) * older, parts)
+            acting.append(mean)
+        return acting[0] if parts == 1 else np.stack(acting, axis=-2), (commanded, reached)
 
     def acting(self, inputs: Array) -> Array:
         """Return the inputs that act in each step, for commanded ones ``(..., H, m)``."""
         H, due = inputs.shape[-2], np.zeros_like(inputs)
-        for weight, back in self._parts:
+        whole, share = int(self.delay), self.delay % 1.0
+        for weight, back in ((1.0 - share, whole), (share, whole + 1)):
             due[..., back:, :] += weight * inputs[..., : max(H - back, 0), :]
         reached = np.zeros_like(due[..., 0, :])
         for t in range(H) if self.lag else ():
             due[..., t, :], reached = self._followed(reached, due[..., t, :])
         return due
 
-    @property
-    def _parts(self) -> list[tuple[float, int]]:
-        """The weights of the commanded inputs that are due, and how many steps ago they were commanded."""
-        whole, share = int(self.delay), self.delay % 1.0
-        return [(weight, back) for weight, back in ((1.0 - share, whole), (share, whole + 1)) if weight]
-
-    def _followed(self, reached: Array, due: Array) -> tuple[Array, Array]:
-        """Return the mean over a step of what approaches the inputs that are due, and what it reaches."""
+    def _followed(self, reached: Array, due: Array, parts: int = 1) -> tuple[Array, Array]:
+        """Return the mean over a part of a step of what approaches the inputs that are due, and what it reaches."""
         if not self.lag:
             return due, due
-        missing, gone = reached - due, np.exp(-1 / self.lag)
-        return due + missing * self.lag * (1 - gone), due + missing * gone
+        lag, missing = parts * self.lag, reached - due
+        gone = np.exp(-1 / lag)
+        return due + missing * lag * (1 - gone), due + missing * gone

@@ -160,12 +160,20 @@ class Cause(ShortRepr):
         """Return the cause with other sizes."""
         return replace(self, sizes=tuple(float(size) for size in sizes))
 
+    @property
+    def kind(self) -> Cause:
+        """The cause without its sizes: two causes of one kind are one cause."""
+        return replace(self, sizes=())
+
     def model(self, model: Model) -> Model:
         """Return the model of the mechanics."""
         return model
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        """Return the inputs that act ``(..., m)`` for those of causes before, and a memory; None at the first step."""
+        """Return the inputs that act ``(..., m)`` for those of causes before, and a memory; None at the first step.
+
+        If they change while a step goes on, they are those of its parts ``(..., parts, m)``.
+        """
         return u, memory
 
     def duration(self, model: Model) -> float:
@@ -246,6 +254,7 @@ class Repaired(ShortRepr):
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next recorded states ``(..., n)`` of recorded states; causes that remember are left out."""
+        x, u = paired(x, u)
         for cause in self.causes:
             u = u if cause.remembers else cause.follow(u, None)[0]
         return self.recorded(self.reached(self.true(x), u))
@@ -256,8 +265,8 @@ class Repaired(ShortRepr):
         inside = [cause for cause in self.causes if type(cause).within is not Cause.within]
         with np.errstate(all="ignore"):
             while duration > 0:  # whole steps of M, and the rest of one
-                if inside or duration < 1:
-                    flow = Flow.of(self.mechanics, *paired(x, acting), at)
+                if inside or duration < 1 or acting.ndim > x.ndim:
+                    flow = Flow.of(self.mechanics, x, acting, at)
                     x = functools.reduce(lambda flow, cause: cause.within(flow), inside, flow).end(min(duration, 1.0))
                 else:
                     x = np.asarray(self.mechanics.step(x, acting))
@@ -277,15 +286,13 @@ class Repaired(ShortRepr):
         return x
 
     def acting(self, inputs: Array) -> Array:
-        """Return the inputs that act in each step, for commanded ones ``(..., H, m)``."""
+        """Return the inputs that act in each step, for commanded ones ``(..., H, m)``; see :meth:`Cause.follow`."""
+        acting = list(np.moveaxis(inputs, -2, 0))
         for cause in self.causes:
-            if cause.remembers:
-                memory, commanded, inputs = None, inputs, np.empty_like(inputs)
-                for t in range(inputs.shape[-2]):
-                    inputs[..., t, :], memory = cause.follow(commanded[..., t, :], memory)
-            else:
-                inputs, _ = cause.follow(inputs, None)
-        return inputs
+            memory = None
+            for t, u in enumerate(acting):
+                acting[t], memory = cause.follow(u, memory)
+        return np.stack(acting, axis=inputs.ndim - 2)
 
     def execute(self, controller: Controller, task: Task, noise: Array | None = None) -> Trajectory:
         """Return the closed loop with all causes; the controller acts on what is recorded.

@@ -92,7 +92,8 @@ class Evidence:
 
     def left_by(self, repaired: Repaired, window: Predictions, moved: Array | float = 0.0) -> Array:
         """Return predicted minus recorded states ``(N, n)``; predictions begin at recorded states that are moved."""
-        acting = repaired.acting(self.inputs).reshape(-1, self.inputs.shape[-1])
+        acting = repaired.acting(self.inputs)
+        acting = acting.reshape(-1, *acting.shape[2:])
         x = repaired.true(self.states[window.states] + moved)
         moved_back = any(type(cause).true is not Cause.true for cause in repaired.causes)
         for k in range(window.steps):

@@ -259,18 +259,21 @@ class _Study:
 
     def _ranked(self, beside: tuple[CauseCandidate, ...]) -> list[Explanation]:
         """Return explanations by each cause beside given ones, the most probable first; the best of a screening."""
-        kinds = [each.cause.with_sizes(()) for each in beside]
+        kinds = [each.cause.kind for each in beside]
         results = []
         for each in self.dictionary:
-            if each.cause.with_sizes(()) not in kinds:
-                together = (*beside, each)
+            together = (*beside, each)
+            within = [other for other in together if not getattr(other.cause, "held", True)]
+            if each.cause.kind not in kinds and len(within) < 2:
                 results.append((*screened(self.some, together), together))
             advance(1)
         results.sort(key=lambda result: result[0])
         # What comes to less than a quarter of the evidence of the best one is not worth a fit.
         worth = [result for result in results[:_FITTED] if result[0] <= 0.25 * results[0][0]]
         refined = [explained(self.evidence, together, begun) for _, begun, together in worth or results[:1]]
-        return sorted(refined, key=lambda explanation: explanation.criterion)
+        refined.sort(key=lambda explanation: -explanation.criterion)
+        best = {tuple(cause.kind for cause in each.repaired.causes): each for each in refined}
+        return sorted(best.values(), key=lambda explanation: explanation.criterion)
 
     def _chosen(self, ranked: list[Explanation]) -> tuple[Explained | None, list[Explained]]:
         """Return the most probable explanation that counts, and those that the executions do not tell from it.

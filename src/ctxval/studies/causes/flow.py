@@ -14,10 +14,10 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
-from ctxval.core.model import Model
+from ctxval.core.model import Model, paired
 from ctxval.models import MuJoCo
 
-_PARTS = 8  # of a step, a power of 2
+PARTS = 8  #: of a step, a power of 2
 
 Push = tuple[Array, int, Callable[[Array, Array], Array]]
 """The change of the state by a unit of a force in a step ``(..., n)``, the state that is its rate, and the force
@@ -40,9 +40,9 @@ class Linearisation(ShortRepr):
         jacobian = getattr(model, "jacobian", None)
         J = _slopes(model, x, u) if jacobian is None else jacobian(x, u)[0]
         A = logarithm(np.where(np.isfinite(J).all(axis=(-2, -1), keepdims=True), J, unit))
-        moved = _moved(A, 1 / _PARTS)
+        moved = _moved(A, 1 / PARTS)
         held, grown = moved, unit + A @ moved
-        for _ in range(_PARTS.bit_length() - 1):
+        for _ in range(PARTS.bit_length() - 1):
             held, grown = held + grown @ held, grown @ grown
         return cls(A, np.linalg.inv(held))
 
@@ -70,13 +70,24 @@ class Flow(ShortRepr):
     at: Linearisation
     A: Array  #: shape ``(..., n, n)`` or ``(n, n)``
     d: Array  #: shape ``(..., n)``
+    varied: Array  #: what is added to d in each part of the step, ``(parts, ..., n)``
     pushes: tuple[Push, ...] = field(default=())
 
     @classmethod
     def of(cls, model: Model, x: Array, u: Array, at: Linearisation | None = None) -> Flow:
-        """Return the flow of a step of a model, which ends where the step ends, by a linearisation near the state."""
-        at = Linearisation.of(model, x, u) if at is None else at
-        return cls(model, x, u, at, at.A, _times(at.driven, np.asarray(model.step(x, u)) - x))
+        """Return the flow of a step of a model, which ends where the step ends, by a linearisation near the state.
+
+        Inputs may differ in the parts of the step, ``(..., parts, m)``.
+        """
+        mean, varied = u, np.zeros((PARTS, *x.shape))
+        if u.ndim > x.ndim:
+            mean = u.mean(axis=-2)
+        at = Linearisation.of(model, x, mean) if at is None else at
+        reached = np.asarray(model.step(x, mean))
+        if u.ndim > x.ndim:
+            each = np.asarray(model.step(*paired(x[..., None, :], u))) - reached[..., None, :]
+            varied = np.moveaxis(_times(at.driven[..., None, :, :], each), -2, 0)
+        return cls(model, x, mean, at, at.A, _times(at.driven, reached - x), varied)
 
     def driven(self, change: Array) -> Array:
         """Return the d ``(..., n)`` that is held and makes a change of the state in a step of M."""
@@ -84,11 +95,11 @@ class Flow(ShortRepr):
 
     def end(self, duration: float = 1.0) -> Array:
         """Return the state ``(..., n)`` after a part of a step of M."""
-        moved = _moved(self.A, duration / _PARTS)
+        moved = _moved(self.A, duration / PARTS)
         effects = [(_times(moved, push), rate, force) for push, rate, force in self.pushes]
         x = self.start
-        for _ in range(_PARTS):
-            reached = x + _times(moved, self.d + _times(self.A, x - self.start))
+        for varied in self.varied:
+            reached = x + _times(moved, self.d + varied + _times(self.A, x - self.start))
             for effect, rate, force in effects:
                 moving = np.where(np.abs(effect[..., rate]) > 1e-12, effect[..., rate], 1e-12)
                 size = force(0.5 * (x[..., rate] + reached[..., rate]), -reached[..., rate] / moving)

@@ -195,7 +195,7 @@ class Inertia(Cause):
         n = flow.start.shape[-1]
         divided = np.eye(n) + (1.0 / self.sizes[0] - 1.0) * _accelerations(n, self.joints, self.dt)
         pushes = tuple((drive @ divided.T, rate, force) for drive, rate, force in flow.pushes)
-        return replace(flow, A=divided @ flow.A, d=flow.d @ divided.T, pushes=pushes)
+        return replace(flow, A=divided @ flow.A, d=flow.d @ divided.T, varied=flow.varied @ divided.T, pushes=pushes)
 
     def text(self, plant: Plant) -> str:
         names = " and ".join(map(plant.joint_name, self.joints))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any, ClassVar
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.studies.causes.cause import Cause, CauseCandidate, Plant, of_ratio, of_size
+from ctxval.studies.causes.flow import PARTS
 from ctxval.systems.actuator import Actuator
 
 
@@ -138,28 +139,48 @@ class ReversedInput(OfInput):
 
 
 @dataclass(frozen=True)
-class Delay(Cause):
-    """All inputs act late. Size: the delay in steps, which need not be an integer. Before the first input, 0 acts."""
+class Late(Cause):
+    """All inputs act late. Before the first input, 0 acts."""
 
-    name: ClassVar[str] = "delay"
     remembers: ClassVar[bool] = True
+    held: bool = True  #: whether the mean over a step acts in it, as in :class:`ctxval.systems.Imperfect`
+
+    @property
+    def actuator(self) -> Actuator:
+        """What the inputs pass."""
+        raise NotImplementedError
+
+    @property
+    def kind(self) -> Cause:
+        return replace(self, sizes=(), held=True)
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        return Actuator(delay=max(self.sizes[0], 0.0)).follow(u, memory)
+        return self.actuator.follow(u, memory, 1 if self.held else PARTS)
+
+
+@dataclass(frozen=True)
+class Delay(Late):
+    """All inputs act late. Size: the delay in steps, which need not be an integer."""
+
+    name: ClassVar[str] = "delay"
+
+    @property
+    def actuator(self) -> Actuator:
+        return Actuator(delay=max(self.sizes[0], 0.0))
 
     def text(self, plant: Plant) -> str:
         return f"commands arrive {_duration(plant.dt * self.sizes[0])} late ({self.sizes[0]:.3g} steps)"
 
 
 @dataclass(frozen=True)
-class Lag(Cause):
+class Lag(Late):
     """All inputs are followed by a first-order lag. Size: the time constant in steps."""
 
     name: ClassVar[str] = "lag"
-    remembers: ClassVar[bool] = True
 
-    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        return Actuator(lag=max(self.sizes[0], 1e-3)).follow(u, memory)
+    @property
+    def actuator(self) -> Actuator:
+        return Actuator(lag=max(self.sizes[0], 1e-3))
 
     def text(self, plant: Plant) -> str:
         return f"the actuators follow with a time constant of {_duration(plant.dt * self.sizes[0])}"
@@ -251,8 +272,9 @@ def of_inputs(plant: Plant) -> Iterator[CauseCandidate]:
         yield of_ratio(InputGain((1.0,), None))
     for first, second in combinations(range(m), 2):
         yield CauseCandidate(SwappedInputs((), first, second))
-    yield of_size(Delay((1.0,)), 0.0, 8.0, 0.2, 0.5, 1.5, 2.5, 4.0)
-    yield of_size(Lag((1.0,)), 0.05, 10.0, 0.2, 0.5, 1.5, 4.0)
+    for held in (True, False) if plant.compiled is None else (True,):  # parts of steps of MuJoCo cost more
+        yield of_size(Delay((1.0,), held), 0.0, 8.0, 0.2, 0.5, 1.5, 2.5, 4.0)
+        yield of_size(Lag((1.0,), held), 0.05, 10.0, 0.2, 0.5, 1.5, 4.0)
 
 
 def of_sensors(plant: Plant, x: Array) -> Iterator[CauseCandidate]:
