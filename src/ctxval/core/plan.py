@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike
-from ctxval._util.representation import ShortRepr
+from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller, started
 from ctxval.core.space import Parameters
@@ -133,14 +133,45 @@ def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:
         return False
 
 
+def observation_delay(executed: Sequence[tuple[Plan, Trajectory]], most: int = 12) -> int:
+    """Return the steps by which the states are old at which controllers gave the recorded inputs; 0 if they are not.
+
+    They are old if the controllers of the plans then give these inputs to a third of the difference at the latest
+    states. Before an old state is known, it is the first one. Controllers that cannot be run tell nothing.
+    """
+
+    def gap(steps: int) -> float:
+        squares = 0.0
+        for plan, run in executed:
+            seen = run.states[np.maximum(np.arange(run.horizon) - steps, 0)]
+            sizes = np.maximum((run.inputs**2).mean(axis=0), 1e-300)
+            squares += float((((np.array(list(_inputs_along(plan, seen))) - run.inputs) ** 2).mean(axis=0) / sizes).sum())
+        return squares
+
+    try:
+        with np.errstate(all="ignore"):
+            latest = gap(0)
+            if not latest > 1e-3**2 * len(executed):
+                return 0
+            shortest = min(run.horizon for _, run in executed)
+            gaps = [latest, *(gap(steps) for steps in range(1, min(most, shortest // 3) + 1))]
+    except Exception:  # the user's controller, at states that it never reached by itself
+        return 0
+    best = int(np.nanargmin(gaps))
+    return best if gaps[best] < latest / 9 else 0
+
+
 def input_difference(validation: Validation, plan: Plan, trajectory: Trajectory) -> str | None:
-    """Return where recorded inputs are not those that the controller of the plan gives at the recorded states.
+    """Return how recorded inputs differ from those that the controller of the plan gives at the recorded states.
 
     Returns None if they differ by at most a third, as the root mean square of each input over the steps: sensors,
-    clocks and drives make such differences, and a recording of another run makes larger ones. It is also None if the
-    controller cannot be run along these states.
+    clocks and drives make such differences, and a recording of another run makes larger ones. Inputs that the
+    controller gives at older states are named in any case. It is also None if the controller cannot be run along these
+    states.
     """
     states, inputs = trajectory.states, trajectory.inputs
+    if old := observation_delay([(plan, trajectory)]):
+        return f"they are those at states that are {counted(old, 'step')} old"
     try:
         with np.errstate(all="ignore"):
             given = np.array(list(_inputs_along(plan, states[:-1])))

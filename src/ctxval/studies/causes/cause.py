@@ -184,6 +184,10 @@ class Cause(ShortRepr):
         """Return the flow of a step for the flow without this cause."""
         return flow
 
+    def seeing(self, controller: Controller) -> Controller:
+        """Return a controller that sees what this cause lets it see of the records."""
+        return controller
+
     def true(self, recorded: Array) -> Array:
         """Return the states ``(..., n)`` of which these are recorded."""
         return recorded
@@ -311,4 +315,6 @@ class Repaired(ShortRepr):
             truth = self.reached(truth, u)
             return self.recorded(truth) + next(added, 0.0)
 
+        for cause in self.causes:
+            controller = cause.seeing(controller)
         return rollout(step, controller, task)

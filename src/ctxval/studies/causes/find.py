@@ -13,7 +13,7 @@ from ctxval._util.progress import advance, stage
 from ctxval._util.representation import ShortRepr
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import at_points, executed_trials
-from ctxval.core.plan import Plan
+from ctxval.core.plan import Plan, observation_delay
 from ctxval.core.system import System, WithOutputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
@@ -203,21 +203,27 @@ class _Study:
         self.dictionary = candidates(self.plant, x[usable], u[usable], residuals[usable], outputs=self.outputs)
         self.loops = ClosedLoops(validation, executions)
         self.before = max(self.loops.distances)
+        # What recorded inputs tell is known beside every other cause.
+        old = observation_delay([(each.plan, each.executed) for each in executions])
+        self.known = (CauseCandidate(signals.ObservationDelay(steps=old)),) if old else ()
 
     def report(self, most: int) -> CauseReport:
-        from_start = None if self.outputs else self._in_closed_loop(Explanation((), Repaired(self.model, ()), 0.0, 1.0))
-        if from_start is not None and from_start.complete >= _NAMED:
+        known = Repaired(self.model, tuple(each.cause for each in self.known))
+        first = None if self.outputs and not self.known else self._in_closed_loop(Explanation(self.known, known, 0.0, 1.0))
+        if first is not None and first.complete >= _NAMED:
+            if self.known:
+                return self._reported([first], [], False)
             offset = self._offset_of_starts()
-            return self._reported([] if offset is None else [replace(from_start, explanation=offset)], [], True)
+            return self._reported([] if offset is None else [replace(first, explanation=offset)], [], True)
         with stage("fitting causes", (2 * most - 1) * len(self.dictionary), "causes"):
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
-            while chosen is not None and chosen.counts(self.before) and len(chosen.explanation.candidates) < most:
+            while chosen is not None and chosen.counts(self.before) and len(self._fitted(chosen)) < most:
                 if chosen.explanation.left < 0.02 or chosen.complete > 0.99:  # nothing is left for another cause
                     break
-                better, others = self._chosen(self._ranked(chosen.explanation.candidates))
+                better, others = self._chosen(self._ranked(self._fitted(chosen)))
                 if better is not None:  # the first one was chosen without the other ones
-                    better, others = self._chosen(self._ranked(better.explanation.candidates[1:]))
+                    better, others = self._chosen(self._ranked(self._fitted(better)[1:]))
                 if better is None or not better.counts(self.before):
                     break
                 if better.explanation.criterion > chosen.explanation.criterion - _ALIKE:
@@ -225,7 +231,12 @@ class _Study:
                 if 1 - better.complete > 0.5 * (1 - chosen.complete):
                     break
                 chosen, alike = better, others
+        if chosen is None and first is not None and self.known:
+            chosen, alike = first, []
         return self._reported([] if chosen is None else [chosen, *alike], ranked, False)
+
+    def _fitted(self, chosen: Explained) -> tuple[CauseCandidate, ...]:
+        return chosen.explanation.candidates[len(self.known) :]
 
     def _reported(self, group: list[Explained], ranked: list[Explanation], began_elsewhere: bool) -> CauseReport:
         named = bool(group) and group[0].counts(self.before) and group[0].complete >= _NAMED
@@ -262,7 +273,7 @@ class _Study:
         kinds = [each.cause.kind for each in beside]
         results = []
         for each in self.dictionary:
-            together = (*beside, each)
+            together = (*self.known, *beside, each)
             within = [other for other in together if not getattr(other.cause, "held", True)]
             if each.cause.kind not in kinds and len(within) < 2:
                 results.append((*screened(self.some, together), together))

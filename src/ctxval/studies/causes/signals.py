@@ -10,6 +10,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.representation import counted
+from ctxval.core.controller import Controller, memory_of, stepped
+from ctxval.core.task import Task
 from ctxval.studies.causes.cause import Cause, CauseCandidate, Plant, of_ratio, of_size
 from ctxval.studies.causes.flow import PARTS
 from ctxval.systems.actuator import Actuator
@@ -184,6 +187,42 @@ class Lag(Late):
 
     def text(self, plant: Plant) -> str:
         return f"the actuators follow with a time constant of {_duration(plant.dt * self.sizes[0])}"
+
+
+@dataclass(frozen=True)
+class ObservationDelay(Cause):
+    """The controller acts on old records. Their age is counted, and not fitted."""
+
+    sizes: tuple[float, ...] = ()
+    name: ClassVar[str] = "observation delay"
+    remembers: ClassVar[bool] = True
+    steps: int = 1  #: the age
+
+    def seeing(self, controller: Controller) -> Controller:
+        return SeeingLate(controller, self.steps)
+
+    def text(self, plant: Plant) -> str:
+        age = _duration(plant.dt * self.steps)
+        return f"the observations that the controller acts on are {counted(self.steps, 'step')} old ({age})"
+
+
+@dataclass(frozen=True)
+class SeeingLate:
+    """A controller that sees states some steps late, and the first one before it sees another one."""
+
+    controller: Controller
+    steps: int
+
+    def start(self, task: Task) -> Any:
+        """Return the memory before the first step."""
+        return memory_of(self.controller, task), ()
+
+    def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
+        """Return the inputs and the memory after the step."""
+        of_controller, before = memory
+        known = (*before, np.array(x))[-self.steps - 1 :]
+        u, of_controller = stepped(self.controller, t, known[0], of_controller)
+        return u, (of_controller, known)
 
 
 @dataclass(frozen=True)
