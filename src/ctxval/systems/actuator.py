@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,14 +28,16 @@ class Actuator:
         With parts, they are the means over these parts of the step, ``(..., parts, m)``. The memory has the latest
         commands, the latest first, and what the lag has reached when the step ends.
         """
+        whole, late = int(self.delay), parts * (self.delay % 1.0)
         commanded, reached = ((), np.zeros_like(u)) if memory is None else memory
-        commanded = (u, *commanded)[: int(self.delay) + 2]
-        newer, older = ((*commanded, *[np.zeros_like(u)] * (int(self.delay) + 2))[int(self.delay) + k] for k in (0, 1))
-        acting = []
-        for weight in np.clip(np.arange(1, parts + 1) - parts * (self.delay % 1.0), 0.0, 1.0):
-            mean, reached = self._followed(reached, weight * newer + (1 - weight) * older, parts)
-            acting.append(mean)
-        return acting[0] if parts == 1 else np.stack(acting, axis=-2), (commanded, reached)
+        commanded = (u, *commanded)[: whole + 2]
+        newer, older = ((*commanded, *[np.zeros_like(u)] * (whole + 2))[whole + k] for k in (0, 1))
+        weights = np.clip(np.arange(1, parts + 1) - late, 0.0, 1.0) if late else np.ones(parts)
+        weights = weights.reshape(-1, *[1] * np.ndim(u))
+        acting = weights * newer + (1 - weights) * older
+        for part in acting if self.lag else ():
+            part[...], reached = self._followed(reached, part, parts)
+        return acting[0] if parts == 1 else np.moveaxis(acting, 0, -2), (commanded, reached)
 
     def acting(self, inputs: Array) -> Array:
         """Return the inputs that act in each step, for commanded ones ``(..., H, m)``."""
@@ -49,8 +52,6 @@ class Actuator:
 
     def _followed(self, reached: Array, due: Array, parts: int = 1) -> tuple[Array, Array]:
         """Return the mean over a part of a step of what approaches the inputs that are due, and what it reaches."""
-        if not self.lag:
-            return due, due
         lag, missing = parts * self.lag, reached - due
-        gone = np.exp(-1 / lag)
-        return due + missing * lag * (1 - gone), due + missing * gone
+        gone = math.exp(-1 / lag)
+        return due + missing * (lag * (1 - gone)), due + missing * gone

@@ -30,6 +30,7 @@ from ctxval.studies.causes.signals import (
     SensorScale,
     SwappedInputs,
     SwappedJoints,
+    WrappedAngle,
 )
 
 __all__ = [
@@ -61,5 +62,6 @@ __all__ = [
     "SwappedJoints",
     "TimeStep",
     "Viscous",
+    "WrappedAngle",
     "find_causes",
 ]

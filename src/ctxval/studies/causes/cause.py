@@ -196,6 +196,10 @@ class Cause(ShortRepr):
         """Return what is recorded of states ``(..., n)``."""
         return x
 
+    def gap(self, difference: Array) -> Array:
+        """Return differences of recorded states ``(..., n)`` as they are to be compared."""
+        return difference
+
     def text(self, plant: Plant) -> str:
         """Return what it is with its sizes and units: a clause without a full stop."""
         raise NotImplementedError

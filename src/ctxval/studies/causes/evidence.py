@@ -36,7 +36,7 @@ class Predictions(ShortRepr):
 class Evidence:
     """Recorded executions, and what M misses in them: residuals of sizes ``(n,)`` after one step and after several.
 
-    The states ``(N + k, n)`` are of all k runs, one after the other, and inputs ``(k, H, m)`` are padded with zeros.
+    Causes that are known say how states are compared. The states ``(N + k, n)`` are of all k runs, one after the other, and inputs ``(k, H, m)`` are padded with zeros.
     """
 
     def __init__(
@@ -46,8 +46,9 @@ class Evidence:
         floors: Sequence[Array] | None = None,
         most: tuple[int, int] = (600, 120),
         steps: tuple[int, int] = STEPS,
+        known: tuple[Cause, ...] = (),
     ) -> None:
-        self.model, self.horizons = model, [len(run.inputs) for run in runs]
+        self.model, self.known, self.horizons = model, known, [len(run.inputs) for run in runs]
         self.states = np.concatenate([run.states for run in runs])
         self.inputs = np.zeros((len(runs), max(self.horizons), runs[0].inputs.shape[1]))
         for padded, run in zip(self.inputs, runs, strict=True):
@@ -57,7 +58,7 @@ class Evidence:
         for number, length in enumerate(steps):
             window = self._window(min(length, min(self.horizons)), most[number])
             left = self.left_by(Repaired(model, ()), window)
-            changes = _size(self.states[window.states + window.steps] - self.states[window.states])
+            changes = _size(self._gap(self.states[window.states + window.steps] - self.states[window.states]))
             # Smaller residuals are no evidence.
             least = np.hypot(0.01 * _size(left), 1e-3 * changes) if floors is None else floors[number]
             self.windows.append(replace(window, floors=np.maximum(least, 1e-15)))
@@ -99,7 +100,10 @@ class Evidence:
         for k in range(window.steps):
             at = None if moved_back else self.linearised[window.states + k]
             x = repaired.reached(x, acting[window.inputs + k], at)
-        return np.asarray(repaired.recorded(x) - self.states[window.states + window.steps])
+        return self._gap(repaired.recorded(x) - self.states[window.states + window.steps])
+
+    def _gap(self, difference: Array) -> Array:
+        return functools.reduce(lambda difference, cause: cause.gap(difference), self.known, difference)
 
     def noise(self, repaired: Repaired) -> Array:
         """Return the standard deviations ``(n,)`` of white noise of measurements, as residuals of one step show it."""
@@ -129,7 +133,7 @@ class Evidence:
     def _explained(self, repaired: Repaired, noise: Array, steps: int) -> tuple[float, float]:
         window, rng = self._window(steps, len(self.states)), np.random.default_rng(0)
         if steps not in self._missed:
-            changes = _size(self.states[window.states + steps] - self.states[window.states])
+            changes = _size(self._gap(self.states[window.states + steps] - self.states[window.states]))
             missed = _size(self.left_by(Repaired(self.model, ()), window))
             self._missed[steps] = missed, missed > 2e-3 * np.maximum(changes, 1e-12)
         sizes, matter = self._missed[steps]

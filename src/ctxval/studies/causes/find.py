@@ -188,12 +188,20 @@ class _Study:
         self.validation, self.executions, self.model = validation, executions, validation.model
         self.outputs = validation.outputs is not None
         horizon = min(len(run.inputs) for run in runs)
+        # What inputs and jumps of the records tell is known, and not fitted.
+        old = observation_delay([(each.plan, each.executed) for each in executions])
+        late = [CauseCandidate(signals.ObservationDelay(steps=old))] if old else []
+        with np.errstate(all="ignore"):
+            following = [np.asarray(self.model.step(run.states[:-1], run.inputs)) for run in runs]
+        self.known = (*late, *signals.wrapped_angles([run.states for run in runs], following))
+        known = tuple(each.cause for each in self.known)
         # Estimated states are worth little in one step.
         steps = (max(1, horizon // 60), max(1, horizon // 12)) if self.outputs else STEPS
-        self.evidence = Evidence(self.model, runs, steps=steps)
+        self.evidence = Evidence(self.model, runs, steps=steps, known=known)
         floors = [window.floors for window in self.evidence.windows]
-        self.some = Evidence(self.model, runs, floors, (200, 40), steps)  # all causes are screened on these
-        self.others = [Evidence(self.model, runs[:k] + runs[k + 1 :], floors, steps=steps) for k in range(len(runs))]
+        self.some = Evidence(self.model, runs, floors, (200, 40), steps, known)  # all causes are screened on these
+        without = (runs[:k] + runs[k + 1 :] for k in range(len(runs)))
+        self.others = [Evidence(self.model, rest, floors, steps=steps, known=known) for rest in without]
         x, u, residuals = self.evidence.pairs
         usable = np.isfinite(residuals).all(axis=1)
         if not usable.any():
@@ -203,9 +211,6 @@ class _Study:
         self.dictionary = candidates(self.plant, x[usable], u[usable], residuals[usable], outputs=self.outputs)
         self.loops = ClosedLoops(validation, executions)
         self.before = max(self.loops.distances)
-        # What recorded inputs tell is known beside every other cause.
-        old = observation_delay([(each.plan, each.executed) for each in executions])
-        self.known = (CauseCandidate(signals.ObservationDelay(steps=old)),) if old else ()
 
     def report(self, most: int) -> CauseReport:
         known = Repaired(self.model, tuple(each.cause for each in self.known))

@@ -79,14 +79,16 @@ class Flow(ShortRepr):
 
         Inputs may differ in the parts of the step, ``(..., parts, m)``.
         """
-        mean, varied = u, np.zeros((PARTS, *x.shape))
-        if u.ndim > x.ndim:
-            mean = u.mean(axis=-2)
+        mean = u.mean(axis=-2) if u.ndim > x.ndim else u
         at = Linearisation.of(model, x, mean) if at is None else at
         reached = np.asarray(model.step(x, mean))
-        if u.ndim > x.ndim:
-            each = np.asarray(model.step(*paired(x[..., None, :], u))) - reached[..., None, :]
-            varied = np.moveaxis(_times(at.driven[..., None, :, :], each), -2, 0)
+        varied = np.zeros((PARTS, *x.shape))
+        if u.ndim > x.ndim:  # inputs go from one to another, in which M is nearly linear
+            ends = u[..., [0, -1], :]
+            across = np.diff(np.asarray(model.step(*paired(x[..., None, :], ends))), axis=-2)
+            line = np.diff(ends, axis=-2)
+            along = ((u - mean[..., None, :]) * line).sum(axis=-1) / np.maximum((line**2).sum(axis=-1), 1e-300)
+            varied = np.moveaxis(along[..., None] * _times(at.driven[..., None, :, :], across), -2, 0)
         return cls(model, x, mean, at, at.A, _times(at.driven, reached - x), varied)
 
     def driven(self, change: Array) -> Array:

@@ -11,7 +11,9 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import counted
+from ctxval._util.turns import turns
 from ctxval.core.controller import Controller, memory_of, stepped
+from ctxval.core.model import Function, Model
 from ctxval.core.task import Task
 from ctxval.studies.causes.cause import Cause, CauseCandidate, Plant, of_ratio, of_size
 from ctxval.studies.causes.flow import PARTS
@@ -278,6 +280,40 @@ class SensorScale(Cause):
 
 
 @dataclass(frozen=True)
+class WrappedAngle(Cause):
+    """The system keeps an angle within a turn, and M does not; or M does, and the system does not."""
+
+    sizes: tuple[float, ...] = ()
+    name: ClassVar[str] = "wrapped angle"
+    state: int = 0
+    turn: float = 2 * np.pi
+    low: float = -np.pi  #: the least value of the angle
+    of_model: bool = False  #: whether it is M that keeps the angle within the turn
+
+    def model(self, model: Model) -> Model:
+        if not self.of_model:
+            return model
+        return Function(lambda x, u: x + self.gap(np.asarray(model.step(x, u)) - x), vectorized=True)
+
+    def recorded(self, x: Array) -> Array:
+        if self.of_model:
+            return x
+        inside = np.array(x)
+        inside[..., self.state] = self.low + (x[..., self.state] - self.low) % self.turn
+        return inside
+
+    def gap(self, difference: Array) -> Array:
+        return difference - _at(difference, self.state, self.turn) * np.round(difference / self.turn)
+
+    def text(self, plant: Plant) -> str:
+        name, pi = plant.states[self.state][0], self.turn < 7
+        whole, half = ("2 pi", "pi") if pi else ("360", "180")
+        ends = f"0 to {whole}" if self.low == 0 else f"-{half} to {half}"
+        keeps = "M, unlike the system, keeps" if self.of_model else "the system, unlike M, keeps"
+        return f"{keeps} {name} within {ends}, with jumps of {whole}"
+
+
+@dataclass(frozen=True)
 class SwappedJoints(Cause):
     """The recorded states of two joints are exchanged."""
 
@@ -328,3 +364,17 @@ def of_sensors(plant: Plant, x: Array) -> Iterator[CauseCandidate]:
     pairs = [group for group in moving if len(group) == len(moving[0])]
     for first, second in combinations(pairs, 2):
         yield CauseCandidate(SwappedJoints((), first, second))
+
+
+def wrapped_angles(x: Sequence[Array], following: Sequence[Array]) -> Iterator[CauseCandidate]:
+    """Yield the states that jump by a turn in runs ``(H + 1, n)`` or in M's next states ``(H, n)`` along them alone."""
+    gaps = [each - run[1:] for each, run in zip(following, x, strict=True)]
+    for state in range(x[0].shape[1]):
+        columns, apart = [run[:, state] for run in x], np.abs(np.concatenate(gaps)[:, state])
+        turn, _ = turns(columns)
+        of_model, columns = not turn, columns if turn else [each[:, state] for each in following]
+        turn = turn or turns(columns)[0]
+        far = apart[apart > 0.5 * turn]
+        if turn and len(far) and (np.abs(far - turn * np.round(far / turn)) < 0.25 * turn).all():
+            low = -0.5 * turn if min(column.min() for column in columns) < -0.02 * turn else 0.0
+            yield CauseCandidate(WrappedAngle((), state, turn, low, of_model))
