@@ -189,7 +189,7 @@ class _Study:
         self.outputs = validation.outputs is not None
         horizon = min(len(run.inputs) for run in runs)
         # What inputs and jumps of the records tell is known, and not fitted.
-        old = observation_delay([(each.plan, each.executed) for each in executions])
+        old = observation_delay([(each.plan.controller, each.plan.task, each.executed) for each in executions])
         late = [CauseCandidate(signals.ObservationDelay(steps=old))] if old else []
         with np.errstate(all="ignore"):
             following = [np.asarray(self.model.step(run.states[:-1], run.inputs)) for run in runs]
