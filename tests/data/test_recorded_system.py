@@ -48,7 +48,7 @@ def test_the_recording_of_a_task_is_its_execution(tmp_path: Path) -> None:
 
 
 def test_inputs_of_another_controller_are_remarked() -> None:
-    with pytest.warns(RecordedInputsWarning, match=r"'lift' are not those of the controller .*\(u0 is 1 at 0.4 s, not 40"):
+    with pytest.warns(RecordedInputsWarning, match=r"those of the controller .*\(u0 is 1 at 0.4 s, not 40"):
         executed = systems.Recorded({"lift": RUN}).execute(law, task("lift"))
     assert np.allclose(executed.inputs, 1.0)
 

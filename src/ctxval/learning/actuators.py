@@ -105,7 +105,7 @@ def found_actuator(
 
 @dataclass(frozen=True)
 class ActuatedController:
-    """A controller with an actuator, which returns the input that acts and the one that is commanded, ``(..., 2 m)``."""
+    """A controller with an actuator, whose inputs ``(..., 2 m)`` are those that act and those that are commanded."""
 
     controller: Controller
     actuator: Actuator

@@ -79,8 +79,9 @@ class Linear:
 def state_space(system: Any, dt: Seconds) -> Linear:
     """Return a ``StateSpace`` of python-control or of scipy as a linear model with its Jacobian.
 
-    The model has the state of the system, so C must be the identity and D 0, if there are any. A continuous system, whose own dt is 0 or None, is
-    discretised exactly for inputs that are held over a step. A discrete system whose dt is True has any time step.
+    The model has the state of the system, so C must be the identity and D must be 0, if there are any. A continuous
+    system, whose own dt is 0 or None, is discretised exactly for inputs that are held over a step. A discrete system
+    whose dt is True has any time step.
     """
     if not all(hasattr(system, name) for name in ("A", "B")):
         raise InputError(f"a state-space model must have A and B, got {system!r}.")
@@ -89,12 +90,11 @@ def state_space(system: Any, dt: Seconds) -> Linear:
         raise ShapeError(f"a state-space model needs A (n, n) and B (n, m), got {A.shape} and {B.shape}.")
     n, m = B.shape
     C, D = (as_finite(name, getattr(system, name, default)) for name, default in (("C", np.eye(n)), ("D", 0.0)))
-    if C.shape != (n, n) or (C != np.eye(n)).any() or D.any():
+    if not np.array_equal(C, np.eye(n)) or D.any():
+        got = f"C = {C.tolist()} and D = {D.tolist()}"
         raise InputError(
-            "C must be the identity and D must be 0, because the states of the model are those of the system, got C = "
-            f"{C.tolist()} and D = {D.tolist()}. Give the system with the A and B of yours alone, and, if S records y "
-            "= C x, the outputs `lambda x: x @ C.T` to the validation; an output that the input changes at once (D) is "
-            "no output of a state."
+            f"C must be the identity and D must be 0, because a model returns states of the system, got {got}: make "
+            "the system of A and B alone, and give outputs=lambda x: x @ C.T to the validation if S records C x."
         )
     step = getattr(system, "dt", None)
     if not step:

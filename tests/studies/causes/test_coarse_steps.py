@@ -7,7 +7,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctxval import Array, Campaign, Labels, Task, TaskSpace, Validation, controllers, distances, models, searches, systems
+from ctxval import (
+    Array,
+    Campaign,
+    Labels,
+    Task,
+    TaskSpace,
+    Validation,
+    controllers,
+    distances,
+    models,
+    searches,
+    systems,
+)
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.core.trajectory import Trajectory
@@ -127,9 +139,10 @@ def wheel(friction: float, low: float | None, turn: float) -> models.Function:
     return models.Function(step, vectorized=True)
 
 
-@pytest.mark.parametrize(
-    ("low", "turn", "ends"), [(-np.pi, 2 * np.pi, "-pi to pi"), *more((0.0, 2 * np.pi, "0 to 2 pi"), (-180.0, 360.0, "-180 to 180"))]
-)
+OTHER_TURNS = ((0.0, 2 * np.pi, "0 to 2 pi"), (-180.0, 360.0, "-180 to 180"))
+
+
+@pytest.mark.parametrize(("low", "turn", "ends"), [(-np.pi, 2 * np.pi, "-pi to pi"), *more(*OTHER_TURNS)])
 def test_an_angle_that_the_system_keeps_within_a_turn_is_named(low: float, turn: float, ends: str) -> None:
     report = found(systems.Simulated(wheel(0.5, low, turn)), wheel(0.5, None, turn), 0.1, 30)
     assert [cause.name for cause in report.causes] == ["wrapped angle"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -41,8 +43,8 @@ def joint(**input: int) -> Joint:
     ],
 )
 @given(LENGTHS)
-def test_a_linear_model_has_the_step_of_the_changed_equation(cause: object, true: tuple[Array, Array], dt: float) -> None:
-    repaired = Repaired(sampled(*arm(), dt), (cause(dt),))  # type: ignore[operator]
+def test_a_linear_model_has_the_step_of_the_changed_equation(cause: Any, true: tuple[Array, Array], dt: float) -> None:
+    repaired = Repaired(sampled(*arm(), dt), (cause(dt),))
     np.testing.assert_allclose(repaired.step(STATES, INPUTS), sampled(*true, dt).step(STATES, INPUTS), atol=2e-5)
 
 
@@ -93,5 +95,3 @@ def test_a_smooth_model_is_interpolated_to_the_third_order(part: float) -> None:
 
     assert error(0.2) < 1e-3
     assert error(0.05) < 1.6 * error(0.1) / 8 + 1e-9  # with the third power of dt
-
-

@@ -7,9 +7,9 @@ import pytest
 
 from ctxval import Campaign, Parameters, Task, TaskSpace, Validation, controllers, distances, models, searches, systems
 from ctxval.studies import causes
-from ctxval.studies.causes.flow import Flow
 from ctxval.studies.causes import CauseReport, Joint, find_causes
 from ctxval.studies.causes.cause import plant_of
+from ctxval.studies.causes.flow import Flow
 from rig_thorough import more
 
 pytest.importorskip("mujoco")

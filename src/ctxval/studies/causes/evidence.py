@@ -36,7 +36,8 @@ class Predictions(ShortRepr):
 class Evidence:
     """Recorded executions, and what M misses in them: residuals of sizes ``(n,)`` after one step and after several.
 
-    Causes that are known say how states are compared. The states ``(N + k, n)`` are of all k runs, one after the other, and inputs ``(k, H, m)`` are padded with zeros.
+    The states ``(N + k, n)`` are of all k runs, one after the other, and inputs ``(k, H, m)`` are padded with zeros.
+    Causes that are known say how states are compared.
     """
 
     def __init__(

@@ -213,8 +213,10 @@ class _Study:
         self.before = max(self.loops.distances)
 
     def report(self, most: int) -> CauseReport:
-        known = Repaired(self.model, tuple(each.cause for each in self.known))
-        first = None if self.outputs and not self.known else self._in_closed_loop(Explanation(self.known, known, 0.0, 1.0))
+        first = None
+        if self.known or not self.outputs:
+            known = Repaired(self.model, tuple(each.cause for each in self.known))
+            first = self._in_closed_loop(Explanation(self.known, known, 0.0, 1.0))
         if first is not None and first.complete >= _NAMED:
             if self.known:
                 return self._reported([first], [], False)

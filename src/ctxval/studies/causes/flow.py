@@ -44,7 +44,7 @@ class Linearisation(ShortRepr):
         held, grown = moved, unit + A @ moved
         for _ in range(PARTS.bit_length() - 1):
             held, grown = held + grown @ held, grown @ grown
-        return cls(A, np.linalg.inv(held))
+        return cls(A, np.asarray(np.linalg.inv(held), dtype=np.float64))
 
     def __getitem__(self, rows: Rows) -> Linearisation:
         """Return that at some of the states; a linear model has the same everywhere."""
@@ -70,6 +70,7 @@ class Flow(ShortRepr):
     at: Linearisation
     A: Array  #: shape ``(..., n, n)`` or ``(n, n)``
     d: Array  #: shape ``(..., n)``
+    reached: Array  #: where the step of M ends, with the mean of the inputs, ``(..., n)``
     varied: Array  #: what is added to d in each part of the step, ``(parts, ..., n)``
     pushes: tuple[Push, ...] = field(default=())
 
@@ -89,7 +90,7 @@ class Flow(ShortRepr):
             line = np.diff(ends, axis=-2)
             along = ((u - mean[..., None, :]) * line).sum(axis=-1) / np.maximum((line**2).sum(axis=-1), 1e-300)
             varied = np.moveaxis(along[..., None] * _times(at.driven[..., None, :, :], across), -2, 0)
-        return cls(model, x, mean, at, at.A, _times(at.driven, reached - x), varied)
+        return cls(model, x, mean, at, at.A, _times(at.driven, reached - x), reached, varied)
 
     def driven(self, change: Array) -> Array:
         """Return the d ``(..., n)`` that is held and makes a change of the state in a step of M."""
@@ -125,7 +126,7 @@ def logarithm(J: Array) -> Array:
     unit = np.eye(J.shape[-1])
     rows = J.reshape(-1, *unit.shape)
     result = rows - unit
-    ratio = np.linalg.solve(rows + (1 + 1e-12) * unit, result)  # an eigenvalue may be -1
+    ratio = np.asarray(np.linalg.solve(rows + (1 + 1e-12) * unit, result), np.float64)  # an eigenvalue may be -1
     near = _near(ratio)
     far = np.flatnonzero(~near)
     if len(far):
@@ -162,4 +163,4 @@ def _by_roots(J: Array) -> Array:
             product = 0.5 * (unit + 0.5 * (product + inverse))
             if (np.abs(product - unit) < 1e-14).all():
                 break
-    return 32 * _by_series(np.linalg.solve(J + unit, J - unit))
+    return 32 * _by_series(np.asarray(np.linalg.solve(J + unit, J - unit), np.float64))

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, rows_of
 from ctxval.core.model import Model
 from ctxval.models import MuJoCo
 from ctxval.studies.causes.cause import Cause, CauseCandidate, Joint, Plant, of_ratio, of_size
@@ -17,7 +17,7 @@ from ctxval.studies.causes.flow import Flow
 
 @dataclass(frozen=True)
 class Force(Cause):
-    """A force on a joint, in units of its input, of MuJoCo, or of an acceleration; held over a step."""
+    """A force on a joint, in units of its input, of MuJoCo, or of an acceleration, which acts while a step goes on."""
 
     joint: Joint = Joint(0)  # noqa: RUF009  # where it enters; it is frozen
     probe: float = 1.0  #: a force that is typical of the joint, with which its effect in M is measured
@@ -27,15 +27,14 @@ class Force(Cause):
         """Return the change of the state by one unit of the force in a step of M, in units of ``flow.d``."""
         model, x, u = flow.model, flow.start, flow.inputs
         if self.joint.dof is not None:  # of a model of MuJoCo
-            forces = np.zeros(model.compiled.nv)  # type: ignore[attr-defined]
-            forces[self.joint.dof] = self.probe
+            forces = self.probe * np.eye(model.compiled.nv)[self.joint.dof]  # type: ignore[attr-defined]
             pushed = model.changed(forces=forces).step(x, u)  # type: ignore[attr-defined]
-            return flow.driven((pushed - model.step(x, u)) / self.probe)
+            return flow.driven((pushed - flow.reached) / self.probe)
         if self.joint.input is not None:
-            moved = np.array(u)
-            moved[..., self.joint.input] += self.probe
-            return flow.driven((np.asarray(model.step(x, moved)) - np.asarray(model.step(x, u))) / self.probe)
-        return np.broadcast_to(self.dt * _gained(x.shape[-1], self.joint, self.dt), x.shape)
+            moved = u + self.probe * np.eye(u.shape[-1])[self.joint.input]
+            return flow.driven((np.asarray(model.step(x, moved)) - flow.reached) / self.probe)
+        accelerated = _accelerations(x.shape[-1], [self.joint], self.dt)[:, self.joint.rate]
+        return np.broadcast_to(self.dt * accelerated, x.shape)
 
     def force(self, rate: Array, load: Array | float, stopping: Array) -> Array:
         """Return the force ``(...)`` at a rate, a load of the gears, and a force that would stop the joint."""
@@ -81,9 +80,10 @@ class Viscous(Force):
 
     def text(self, plant: Plant) -> str:
         rate = plant.rate_unit(self.joint)
-        more = "more" if self.sizes[0] >= 0 else "less"
-        size = self.amount(plant, abs(self.sizes[0])) + (f" per {rate}" if rate else "")
-        return f"{plant.joint_name(self.joint)} has {more} viscous friction than M ({size})"
+        more, size = "more" if self.sizes[0] >= 0 else "less", self.amount(plant, abs(self.sizes[0]))
+        return (
+            f"{plant.joint_name(self.joint)} has {more} viscous friction than M ({size}{f' per {rate}' * bool(rate)})"
+        )
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class LoadFriction(Force):
             import mujoco
 
             compiled: Any = model.compiled  # type: ignore[attr-defined]
-            states, inputs, nq = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1]), compiled.nq
+            states, inputs, nq = rows_of(x), rows_of(u), compiled.nq
             data, pulls = mujoco.MjData(compiled), np.full(len(states), np.nan)
             for k in np.flatnonzero(np.isfinite(states).all(axis=1)):
                 data.qpos, data.qvel, data.ctrl = states[k, :nq], states[k, nq:], inputs[k]
@@ -166,20 +166,13 @@ class LoadFriction(Force):
         return f"the friction of {name} depends on the load ({100 * self.sizes[0]:.3g} % of it{more})"
 
 
-def _gained(n: int, joint: Joint, dt: float) -> Array:
-    """Return the change of a state ``(n,)`` in which the rate of a joint gains 1, as M integrates it."""
-    change = np.zeros(n)
-    change[joint.rate] = 1.0
-    if joint.position is not None:
-        change[joint.position] = (joint.share - 0.5) * dt
-    return change
-
-
 def _accelerations(n: int, joints: Sequence[Joint], dt: float) -> Array:
-    """Return the part ``(n, n)`` of the derivatives of states that the accelerations of joints make."""
+    """Return the part ``(n, n)`` of derivatives that accelerations of joints make, as M integrates."""
     part = np.zeros((n, n))
     for joint in joints:
-        part[:, joint.rate] = _gained(n, joint, dt)
+        part[joint.rate, joint.rate] = 1.0
+        if joint.position is not None:
+            part[joint.position, joint.rate] = (joint.share - 0.5) * dt
     return part
 
 
@@ -260,8 +253,7 @@ class OfMuJoCo(Cause):
         raise NotImplementedError
 
     def model(self, model: Any) -> Model:
-        changed: Model = model.changed(self.change)
-        return changed
+        return model.changed(self.change)  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True)
@@ -340,8 +332,7 @@ def forces(plant: Plant, joint: Joint, x: Array, u: Array, missed: Array) -> Ite
     """Yield the forces that may enter at a place, in sizes whose effects are as large as what M misses of its rate."""
     probe = 0.1 * float(plant.commanded[joint.input]) if joint.input is not None and joint.dof is None else 1.0
     rows = slice(None, None, max(1, len(x) // 50))
-    unit = Bias((1.0,), joint, probe, plant.dt)
-    effects = unit.drive(Flow.of(plant.model, x[rows], u[rows]))[:, joint.rate]
+    effects = Bias((1.0,), joint, probe, plant.dt).drive(Flow.of(plant.model, x[rows], u[rows]))[:, joint.rate]
     effects = effects[np.isfinite(effects)]
     size = float(np.sqrt((effects**2).mean())) if len(effects) else 0.0
     force = float(missed[joint.rate]) / size if size > 0 else 0.0
@@ -398,8 +389,7 @@ def of_mujoco(plant: Plant, missed: Array) -> Iterator[CauseCandidate]:
             starts = (0.3 * size, size) if attribute == "frictionloss" else (0.0,)
             # More damping would make the integration unstable.
             most = min(20 * size, inertia / compiled.opt.timestep) if attribute == "damping" else 20 * size
-            cause = JointAttribute((0.0,), attribute, joint)
-            yield of_size(cause, low, most, 0.05 * size, *starts)
+            yield of_size(JointAttribute((0.0,), attribute, joint), low, most, 0.05 * size, *starts)
     masses = compiled.body_mass
     moved = (compiled.body_dofnum > 0) | (compiled.body_parentid > 0)
     bodies = [body for body in range(1, compiled.nbody) if masses[body] > 0 and moved[body]]
@@ -407,5 +397,4 @@ def of_mujoco(plant: Plant, missed: Array) -> Iterator[CauseCandidate]:
         yield of_ratio(BodyMass((1.0,), body))
         extent = float(np.sqrt(compiled.body_inertia[body].max() / masses[body]))
         for axis in range(3 if extent > 0 else 0):
-            moved_centre = MassCentre((0.0,), body, axis)
-            yield of_size(moved_centre, -3 * extent, 3 * extent, 0.05 * extent, 0.0)
+            yield of_size(MassCentre((0.0,), body, axis), -3 * extent, 3 * extent, 0.05 * extent, 0.0)
