@@ -153,13 +153,11 @@ def components(context: ReportContext) -> Answer | None:
         f"In the {counted(len(worst), 'worst trial')}, S differs from M most in {label}: by {percent(float(peaks[j]))} "
         f"of its range at the peak, which is at {number(when, 3)} s of {number(end, 3)} s."
     )
-    jumps = [
-        turns([each.states[:, j] for each in side])[0] for side in zip(*((run.system, run.model) for run in worst))
-    ]
-    if jumps[0] != jumps[1]:
+    turn_of_s = turns([run.system.states[:, j] for run in worst])[0]
+    if turn_of_s != turns([run.model.states[:, j] for run in worst])[0]:
         text += (
-            f" {label} jumps by a whole turn in the loops of {'S' if jumps[0] else 'M'} alone: continue the angle over "
-            "turns, or list it in the angles of the distance."
+            f" {label} jumps by a whole turn in the loops of {'S' if turn_of_s else 'M'} alone: continue the angle "
+            "over turns, or list it in the angles of the distance."
         )
     shares = _shares(context, worst)
     numbers = {"state": label, "peak": float(peaks[j]), "time": when, "shares": shares}

@@ -262,7 +262,8 @@ class Repaired(ShortRepr):
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next recorded states ``(..., n)`` of recorded states; causes that remember are left out."""
-        x, u = paired(x, u)
+        if x.ndim != u.ndim:
+            x, u = map(np.array, paired(x, u))
         for cause in self.causes:
             u = u if cause.remembers else cause.follow(u, None)[0]
         return self.recorded(self.reached(self.true(x), u))

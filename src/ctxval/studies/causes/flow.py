@@ -55,7 +55,7 @@ def _slopes(model: Model, x: Array, u: Array) -> Array:
     """Return the Jacobian of a step in x by differences that suit single precision, too."""
     sizes = 1e-4 * np.maximum(1.0, np.abs(x))
     moves = np.stack([1.0, -1.0])[:, None, None] * (sizes[..., None, None, :] * np.eye(x.shape[-1]))
-    inputs = np.broadcast_to(u[..., None, None, :], (*moves.shape[:-1], u.shape[-1]))
+    inputs = np.array(np.broadcast_to(u[..., None, None, :], (*moves.shape[:-1], u.shape[-1])))
     up, down = np.moveaxis(np.asarray(model.step(x[..., None, None, :] + moves, inputs)), -3, 0)
     return np.swapaxes((up - down) / (2 * sizes)[..., None], -1, -2)
 
@@ -86,7 +86,7 @@ class Flow(ShortRepr):
         varied = np.zeros((PARTS, *x.shape))
         if u.ndim > x.ndim:  # inputs go from one to another, in which M is nearly linear
             ends = u[..., [0, -1], :]
-            across = np.diff(np.asarray(model.step(*paired(x[..., None, :], ends))), axis=-2)
+            across = np.diff(np.asarray(model.step(*map(np.array, paired(x[..., None, :], ends)))), axis=-2)
             line = np.diff(ends, axis=-2)
             along = ((u - mean[..., None, :]) * line).sum(axis=-1) / np.maximum((line**2).sum(axis=-1), 1e-300)
             varied = np.moveaxis(along[..., None] * _times(at.driven[..., None, :, :], across), -2, 0)

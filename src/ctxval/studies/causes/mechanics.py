@@ -79,11 +79,9 @@ class Viscous(Force):
         return replace(flow, A=A, d=flow.d - drive * flow.start[..., rate, None])
 
     def text(self, plant: Plant) -> str:
-        rate = plant.rate_unit(self.joint)
-        more, size = "more" if self.sizes[0] >= 0 else "less", self.amount(plant, abs(self.sizes[0]))
-        return (
-            f"{plant.joint_name(self.joint)} has {more} viscous friction than M ({size}{f' per {rate}' * bool(rate)})"
-        )
+        rate, more = plant.rate_unit(self.joint), "more" if self.sizes[0] >= 0 else "less"
+        size = self.amount(plant, abs(self.sizes[0])) + (f" per {rate}" if rate else "")
+        return f"{plant.joint_name(self.joint)} has {more} viscous friction than M ({size})"
 
 
 @dataclass(frozen=True)
