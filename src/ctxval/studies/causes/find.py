@@ -192,7 +192,7 @@ class _Study:
         old = observation_delay([(each.plan.controller, each.plan.task, each.executed) for each in executions])
         late = [CauseCandidate(signals.ObservationDelay(steps=old))] if old else []
         with np.errstate(all="ignore"):
-            following = [np.asarray(self.model.step(run.states[:-1], run.inputs)) for run in runs]
+            following = [np.asarray(self.model.step(*map(np.array, (run.states[:-1], run.inputs)))) for run in runs]
         self.known = (*late, *signals.wrapped_angles([run.states for run in runs], following))
         known = tuple(each.cause for each in self.known)
         # Estimated states are worth little in one step.
@@ -289,9 +289,11 @@ class _Study:
         # What comes to less than a quarter of the evidence of the best one is not worth a fit.
         worth = [result for result in results[:_FITTED] if result[0] <= 0.25 * results[0][0]]
         refined = [explained(self.evidence, together, begun) for _, begun, together in worth or results[:1]]
-        refined.sort(key=lambda explanation: -explanation.criterion)
-        best = {tuple(cause.kind for cause in each.repaired.causes): each for each in refined}
-        return sorted(best.values(), key=lambda explanation: explanation.criterion)
+        distinct = list[Explanation]()
+        for each in sorted(refined, key=lambda explanation: explanation.criterion):
+            if not any(_is_same(each, other) for other in distinct):
+                distinct.append(each)
+        return distinct
 
     def _chosen(self, ranked: list[Explanation]) -> tuple[Explained | None, list[Explained]]:
         """Return the most probable explanation that counts, and those that the executions do not tell from it.
@@ -313,6 +315,7 @@ class _Study:
         most_left = 1.3 * left + 2e-4 if left < 0.02 else -np.inf
         alike = [each for each in ranked if each.criterion < most_probable + _ALIKE or each.left < most_left]
         others = [each for each in alike if each is not best.explanation]
+        others.sort(key=lambda each: len(each.sizes))  # the simplest are tried first
         group = [best, *(self._in_closed_loop(each) for each in others[:_CHECKED])]
         group = [each for each in group if 1 - each.share <= 2 * (1 - best.share) + 1e-3]
         first = min((each for each in group if each.counts(self.before)), key=lambda each: len(each.explanation.sizes))
@@ -372,6 +375,12 @@ def candidates(plant: Plant, x: Array, u: Array, residuals: Array, *, outputs: b
         of_size(mechanics.TimeStep((1.0,)), 0.2, 5.0, 0.1, 0.5, 0.95, 1.05, 2.0),
         *(() if outputs else signals.of_sensors(plant, x)),  # states that are estimated have no sensors
     )
+
+
+def _is_same(explanation: Explanation, other: Explanation) -> bool:
+    """Return whether causes of the same kinds have the same sizes: in fine sampling, a delay may be held or not."""
+    kinds = [[cause.kind for cause in each.repaired.causes] for each in (explanation, other)]
+    return kinds[0] == kinds[1] and np.allclose(explanation.sizes, other.sizes, rtol=0.02)
 
 
 def _contains(general: Explained, special: Explained) -> bool:

@@ -82,7 +82,7 @@ class Flow(ShortRepr):
         """
         mean = u.mean(axis=-2) if u.ndim > x.ndim else u
         at = Linearisation.of(model, x, mean) if at is None else at
-        reached = np.asarray(model.step(x, mean))
+        reached = np.array(model.step(np.array(x), np.array(mean)))  # a step may work in place
         varied = np.zeros((PARTS, *x.shape))
         if u.ndim > x.ndim:  # inputs go from one to another, in which M is nearly linear
             ends = u[..., [0, -1], :]

@@ -148,7 +148,7 @@ class LoadFriction(Force):
             return np.asarray(np.abs(flow.d - 2 * pulled)[..., self.joint.rate] / self.dt)
         # What pulls is as large as the motors' forces that would do the same: each of them moves all joints.
         rates, probes = list(self.rates), self.probe * np.eye(m)
-        moved = (np.asarray(model.step(x, np.broadcast_to(each, u.shape))) for each in probes)
+        moved = (np.asarray(model.step(x, np.zeros_like(u) + each)) for each in probes)
         effects = np.stack([flow.driven(each - resting)[..., rates] / self.probe for each in moved], axis=-1)
         effects = np.nan_to_num(effects, nan=0.0, posinf=0.0, neginf=0.0)  # a step of M may have failed
         pulls = u - (np.linalg.pinv(effects) @ pulled[..., rates, None])[..., 0]

@@ -174,7 +174,8 @@ class Delay(Late):
         return Actuator(delay=max(self.sizes[0], 0.0))
 
     def text(self, plant: Plant) -> str:
-        return f"commands arrive {_duration(plant.dt * self.sizes[0])} late ({self.sizes[0]:.3g} steps)"
+        steps = f"{self.sizes[0]:.3g} steps" + ("" if self.held else ", not held over a step")
+        return f"commands arrive {_duration(plant.dt * self.sizes[0])} late ({steps})"
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,8 @@ class Lag(Late):
         return Actuator(lag=max(self.sizes[0], 1e-3))
 
     def text(self, plant: Plant) -> str:
-        return f"the actuators follow with a time constant of {_duration(plant.dt * self.sizes[0])}"
+        held = "" if self.held else " while a step goes on"
+        return f"the actuators follow{held} with a time constant of {_duration(plant.dt * self.sizes[0])}"
 
 
 @dataclass(frozen=True)
