@@ -22,7 +22,7 @@ from ctxval.errors import CtxvalError, DistanceError, InputError
 from ctxval.learning.extended import estimates_by_loops_on_model
 from ctxval.models import MuJoCo
 from ctxval.studies.causes import mechanics, signals
-from ctxval.studies.causes.cause import CauseCandidate, Plant, Repaired, of_size, plant_of
+from ctxval.studies.causes.cause import Cause, CauseCandidate, Plant, Repaired, of_size, plant_of
 from ctxval.studies.causes.evidence import STEPS, Evidence, Explanation, explained, screened
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
 
@@ -231,6 +231,8 @@ class _Study:
                 better, others = self._chosen(self._ranked(self._fitted(chosen)))
                 if better is not None:  # the first one was chosen without the other ones
                     better, others = self._chosen(self._ranked(self._fitted(better)[1:]))
+                if better is not None and _unsized(self._fitted(better)[-1]) != _unsized(self._fitted(chosen)[0]):
+                    better, others = self._chosen(self._ranked(self._fitted(better)[1:]))
                 if better is None or not better.counts(self.before):
                     break
                 if better.explanation.criterion > chosen.explanation.criterion - _ALIKE:
@@ -375,6 +377,10 @@ def candidates(plant: Plant, x: Array, u: Array, residuals: Array, *, outputs: b
         of_size(mechanics.TimeStep((1.0,)), 0.2, 5.0, 0.1, 0.5, 0.95, 1.05, 2.0),
         *(() if outputs else signals.of_sensors(plant, x)),  # states that are estimated have no sensors
     )
+
+
+def _unsized(candidate: CauseCandidate) -> Cause:
+    return replace(candidate.cause, sizes=())
 
 
 def _is_same(explanation: Explanation, other: Explanation) -> bool:
