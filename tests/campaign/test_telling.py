@@ -13,11 +13,13 @@ import pytest
 
 from conftest import make_validation
 from ctxval import Campaign, Experiment, Store, Trajectory, Validation, searches
+from ctxval._util.representation import counted
 from ctxval.campaign.by_hand import parameters_of_trial, result_sentence, tell_result
 from ctxval.campaign.telling import SuppliedResult
 from ctxval.core.trial import Trial
 from ctxval.data import LogMapping
 from ctxval.errors import InputError
+from ctxval.studies.causes.signals import SeeingLate
 
 
 @pytest.fixture
@@ -171,3 +173,12 @@ def test_a_recording_of_another_run_with_the_same_start_is_remarked() -> None:
     sentence = result_sentence(other, "rad", inputs=campaign.input_difference(other))
     assert "; its inputs are not those of the controller at the recorded states (u0 is" in sentence
     assert campaign.input_difference(campaign.tell(campaign.ask(), distance=0.1)) is None
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_inputs_at_old_states_are_remarked_with_their_age(steps: int) -> None:
+    campaign = Campaign(make_validation(), search=searches.Random(), seed=0)
+    opened = campaign.ask({"goal": 2.5})
+    controller, validation = SeeingLate(opened.plan.controller, steps), campaign.validation
+    told = campaign.tell(opened, validation.system.execute(controller, opened.plan.task))
+    assert f"at states that are {counted(steps, 'step')} old" in str(campaign.input_difference(told))

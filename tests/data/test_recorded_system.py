@@ -10,6 +10,7 @@ import pytest
 
 from ctxval import Task, Trajectory, systems
 from ctxval.data import LogMapping
+from ctxval.data.recordings import RecordedInputsWarning
 from ctxval.errors import ExecutionError, InputError
 
 TIMES = 0.1 * np.arange(6)
@@ -19,6 +20,10 @@ MAPPING = {"states": {"x": "x", "v": "v"}, "inputs": {"u": "u"}}
 
 def task(name: str, horizon: int = 5) -> Task:
     return Task([0.0, 0.0], horizon=horizon, dt=0.1, name=name)
+
+
+def constant(t: int, x: np.ndarray) -> np.ndarray:
+    return np.ones(1)
 
 
 def law(t: int, x: np.ndarray) -> np.ndarray:
@@ -34,12 +39,26 @@ def folder_with(path: Path, *names: str) -> Path:
 
 def test_the_recording_of_a_task_is_its_execution(tmp_path: Path) -> None:
     for system in (systems.Recorded({"lift": RUN}), systems.Recorded(folder_with(tmp_path, "lift"), MAPPING)):
-        executed = system.execute(law, task("lift"))
+        executed = system.execute(constant, task("lift"))
         assert np.allclose(executed.states, RUN.states)
         assert np.allclose(executed.inputs, 1.0)
-        assert len(system.execute(law, task("lift", 3)).inputs) == 3
+        assert len(system.execute(constant, task("lift", 3)).inputs) == 3
         assert system.names == ("lift",)
         assert "tasks=1" in repr(system)
+
+
+def test_inputs_of_another_controller_are_remarked() -> None:
+    with pytest.warns(RecordedInputsWarning, match=r"those of the controller .*\(u0 is 1 at 0.4 s, not 40"):
+        executed = systems.Recorded({"lift": RUN}).execute(law, task("lift"))
+    assert np.allclose(executed.inputs, 1.0)
+
+
+def test_inputs_of_old_states_are_remarked() -> None:
+    states = np.random.default_rng(0).normal(size=(31, 2))
+    inputs = np.sin(states[np.maximum(np.arange(30) - 2, 0), :1])
+    system = systems.Recorded({"lift": Trajectory(0.1 * np.arange(31), states, inputs)})
+    with pytest.warns(RecordedInputsWarning, match="they are those at states that are 2 steps old"):
+        system.execute(lambda t, x: np.sin(x[:1]), task("lift", 30))
 
 
 def test_inputs_that_are_not_recorded_are_those_of_the_controller(tmp_path: Path) -> None:

@@ -14,10 +14,11 @@ from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances
 from ctxval._util.arrays import Array
 from ctxval.core.controller import started
 from ctxval.learning import DynamicsStudy
-from ctxval.learning.actuators import Actuator, found_actuator
+from ctxval.learning.actuators import found_actuator
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
+from ctxval.systems.actuator import Actuator
 from rig_thorough import more
 
 H, DT = 40, 0.1

@@ -193,6 +193,23 @@ def test_the_state_that_errs_most_is_named_with_its_unit(swing: ReportContext) -
     assert 0 <= found.numbers["time"] <= worst.system.times[-1]
 
 
+def test_an_angle_that_jumps_in_one_of_both_loops_is_said(swing: ReportContext) -> None:
+    found = found_by(components, swing)
+    assert found is not None
+    assert "whole turn" not in found.text
+
+    def wrapped(run: Trajectory) -> Trajectory:
+        climbing = np.linspace(0, 9, len(run.states))[:, None] + [0.0, 0.0]
+        return replace(run, states=(climbing + np.pi) % (2 * np.pi) - np.pi)
+
+    jumping = {k: pair._replace(system=wrapped(pair.system)) for k, pair in swing.recordings.items()}
+    other = replace(swing)
+    vars(other)["recordings"] = jumping  # in the place of those of the store
+    found = found_by(components, other)
+    assert found is not None
+    assert "jumps by a whole turn in the loops of S alone" in found.text
+
+
 class Jumping:
     """A synthesizer whose input has the sign of the goal, so neighbours on both sides of 0 differ."""
 

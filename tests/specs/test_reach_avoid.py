@@ -85,6 +85,12 @@ def test_the_reach_set_counts_within_its_times_only() -> None:
     reach = Ball([1.0], radius=0.25)
     assert ReachAvoid(reach=reach).robustness(trajectory(states), TASK) == -0.75
     assert ReachAvoid(reach=reach, times=(0.5, 0.5)).robustness(trajectory(states), TASK) == 0.25
+    # The windows contain the recorded time 0.5 s, and not the nearest ones outside of them.
+    assert ReachAvoid(reach=reach, times=(0.3, 0.9)).robustness(trajectory(states), TASK) == 0.25
+    assert ReachAvoid(reach=reach, times=(0.6, 1.1)).robustness(trajectory(states), TASK) == -0.75
+    assert ReachAvoid(reach=reach, times=(0.1 + 0.2 + 0.2, 0.5)).robustness(trajectory(states), TASK) == 0.25
+    with pytest.raises(InputError, match=r"a multiple of dt = 0.5 s, got 0.6 to 0.9 s"):
+        ReachAvoid(reach=reach, times=(0.6, 0.9)).robustness(trajectory(states), TASK)
     with pytest.raises(InputError, match=r"after the end of the task at 2 s, got 9 s"):
         ReachAvoid(reach=reach, times=(0.0, 9.0)).robustness(trajectory(states), TASK)
 

@@ -159,15 +159,17 @@ class Campaign:
         return None if executed is None else start_offset(self.validation, point, executed)
 
     def input_difference(self, trial: Trial) -> str | None:
-        """Return where the recorded inputs of a trial are not those of its controller at the recorded states.
+        """Return how the recorded inputs of a trial are not those of its controller at the recorded states.
 
-        It is a hint that the recording is of another run, or begins at another moment than the controller. Returns None
-        if they agree up to a third, or if nothing was recorded.
+        It is a hint that the recording is of another run, begins at another moment than the controller, or that the
+        controller acts on old states. Returns None if they agree up to a third, or if nothing was recorded.
         """
         executed = self.store.trajectories([trial.number], "system").get(trial.number)
         if executed is not None:
             with suppress(CtxvalError):  # the result is stored, whether or not its controller can be designed again
-                return input_difference(self.validation, self.recorder.plan(trial), executed)
+                plan = self.recorder.plan(trial)
+                names = self.validation.names(executed.states.shape[-1], executed.inputs.shape[-1])[1]
+                return input_difference(plan.controller, plan.task, executed, names)
         return None
 
     # Running

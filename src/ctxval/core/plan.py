@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_floats
-from ctxval._util.representation import ShortRepr
+from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller, started
 from ctxval.core.space import Parameters
@@ -107,9 +107,9 @@ def least_distance(validation: Validation, point: ArrayLike, model: Trajectory, 
     return None
 
 
-def _inputs_along(plan: Plan, states: Array) -> Iterator[Array]:
-    """Yield the inputs ``(m,)`` that the controller of a plan gives at states ``(H, n)``, each when it is asked for."""
-    pi = started(plan.controller, plan.task)
+def inputs_along(controller: Controller, task: Task, states: Array) -> Iterator[Array]:
+    """Yield the inputs ``(m,)`` that a controller gives at states ``(H, n)``, each when it is asked for."""
+    pi = started(controller, task)
     for t, x in enumerate(states):
         yield as_floats("inputs of a controller", pi(t, x.copy()))
 
@@ -127,23 +127,57 @@ def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:
     nearest = tolerance * np.maximum(np.abs(inputs).max(axis=0, initial=0.0), 1e-300)
     try:
         with np.errstate(all="ignore"):
-            pairs = zip(_inputs_along(plan, states[:-1]), inputs, strict=True)
+            pairs = zip(inputs_along(plan.controller, plan.task, states[:-1]), inputs, strict=True)
             return all(bool((np.abs(given - u) <= nearest).all()) for given, u in pairs)
     except Exception:  # the user's controller, at states that it never reached by itself
         return False
 
 
-def input_difference(validation: Validation, plan: Plan, trajectory: Trajectory) -> str | None:
-    """Return where recorded inputs are not those that the controller of the plan gives at the recorded states.
+def observation_delay(runs: Sequence[tuple[Controller, Task, Trajectory]], most: int = 12) -> int:
+    """Return the steps by which the states are old at which controllers gave the recorded inputs; 0 if they are not.
 
-    Returns None if they differ by at most a third, as the root mean square of each input over the steps: sensors,
-    clocks and drives make such differences, and a recording of another run makes larger ones. It is also None if the
-    controller cannot be run along these states.
+    They are old if the controllers give these inputs to a third of the difference at the latest states. Before an old
+    state is known, it is the first one. Controllers that cannot be run tell nothing.
     """
-    states, inputs = trajectory.states, trajectory.inputs
+
+    def gap(steps: int) -> float:
+        squares = 0.0
+        for controller, task, run in runs:
+            seen = run.states[np.maximum(np.arange(run.horizon) - steps, 0)]
+            sizes = np.maximum((run.inputs**2).mean(axis=0), 1e-300)
+            gaps = np.array(list(inputs_along(controller, task, seen))) - run.inputs
+            squares += float(((gaps**2).mean(axis=0) / sizes).sum())
+        return squares
+
     try:
         with np.errstate(all="ignore"):
-            given = np.array(list(_inputs_along(plan, states[:-1])))
+            latest = gap(0)
+            if not latest > 1e-3**2 * len(runs):
+                return 0
+            longest = min(most, min(run.horizon for *_, run in runs) // 3)
+            gaps = [latest, *(gap(steps) for steps in range(1, longest + 1))]
+    except Exception:  # the user's controller, at states that it never reached by itself
+        return 0
+    best = int(np.nanargmin(gaps))
+    return best if gaps[best] < latest / 9 else 0
+
+
+def input_difference(
+    controller: Controller, task: Task, trajectory: Trajectory, names: Mapping[str, str]
+) -> str | None:
+    """Return how recorded inputs, with their names and units, differ from those of a controller at the recorded states.
+
+    Returns None if they differ by at most a third, as the root mean square of each input over the steps: sensors,
+    clocks and drives make such differences, and a recording of another run makes larger ones. Inputs that the
+    controller gives at older states are named in any case. It is also None if the controller cannot be run along these
+    states.
+    """
+    states, inputs = trajectory.states, trajectory.inputs
+    if old := observation_delay([(controller, task, trajectory)]):
+        return f"they are those at states that are {counted(old, 'step')} old"
+    try:
+        with np.errstate(all="ignore"):
+            given = np.array(list(inputs_along(controller, task, states[:-1])))
             gaps = np.abs(given - inputs)
     except Exception:  # the user's controller, at states that it never reached by itself
         return None
@@ -153,7 +187,7 @@ def input_difference(validation: Validation, plan: Plan, trajectory: Trajectory)
     if not apart.any():
         return None
     t, i = np.unravel_index(np.argmax(np.where(apart, gaps / np.maximum(sizes, 1e-300), -1.0)), gaps.shape)
-    name, unit = list(validation.names(states.shape[-1], inputs.shape[-1])[1].items())[i]
+    name, unit = list(names.items())[i]
     return f"{name} is {inputs[t, i]:.3g} {unit}".rstrip() + f" at {trajectory.times[t]:.3g} s, not {given[t, i]:.3g}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, Rows, as_floats
+from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.columns import FAR, conversion, sentinels, time_column, unit_advice
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr, call, counted
 from ctxval._util.texts import enumerated
-from ctxval.core.controller import Controller, started
+from ctxval.core.controller import Controller
+from ctxval.core.plan import input_difference, inputs_along
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.log import Log, Signal, Table
@@ -307,6 +309,10 @@ def _too_short(run: Recording, what: str, dt: float) -> Break:
     return Break(run.source, run.start, run.trajectory.horizon * dt, "a part", f"is too short for {what}")
 
 
+class RecordedInputsWarning(UserWarning):
+    """Recorded inputs are not those of the controller of their task."""
+
+
 @part(files=("runs",))
 class Recorded:
     """Recorded executions of named tasks, such as those of a :class:`ctxval.TaskSuite`, as the true system.
@@ -353,9 +359,17 @@ class Recorded:
             raise ExecutionError(f"the recording of {task.name!r} has {run.horizon} steps, and the task has {steps}")
         times, states, inputs = run.times[: steps + 1], run.states[: steps + 1], run.inputs[:steps]
         if not inputs.shape[-1]:
-            pi = started(controller, task)
-            inputs = np.stack([as_floats("inputs of a controller", pi(t, x.copy())) for t, x in enumerate(states[:-1])])
-        return Trajectory(times, states, inputs)
+            return Trajectory(times, states, np.stack(list(inputs_along(controller, task, states[:-1]))))
+        recorded = Trajectory(times, states, inputs)
+        names = {f"u{i}": "" for i in range(inputs.shape[-1])}
+        if difference := input_difference(controller, task, recorded, names):
+            warnings.warn(
+                f"the inputs of the recording of {task.name!r} are not those of the controller at the recorded states "
+                f"({difference}): check that it was recorded with this controller, and that both begin at once.",
+                RecordedInputsWarning,
+                stacklevel=2,
+            )
+        return recorded
 
     def __repr__(self) -> str:
         return call(self, tasks=len(self.runs))

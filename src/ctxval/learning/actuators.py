@@ -21,6 +21,7 @@ from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior, Mode, learning_rows, log_posterior
 from ctxval.learning.residual_data import floors
 from ctxval.models.increments import standard_deviations
+from ctxval.systems.actuator import Actuator
 
 _LONGEST = 6.0  # steps, of a delay and of a time constant
 _DELAYS, _LAGS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0), (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
@@ -28,46 +29,6 @@ _TRIED = [*((each, 0.0) for each in _DELAYS), *((0.0, each) for each in _LAGS), 
 _BETTER, _NEAR = 0.3, 0.1  # differences of the log evidence per recorded value; see `found_actuator`
 _LEARNED_FROM = 150  # transitions
 _CLIMBED = 4  # candidates whose hyperparameters are searched for
-
-
-@dataclass(frozen=True)
-class Actuator:
-    """How the inputs act that a controller commands; before the first one, they are 0."""
-
-    delay: float = 0.0  # steps by which inputs act late; between whole steps, two inputs act in parts
-    # time constant in steps with which the delayed inputs are followed; 0 if they are followed at once
-    lag: float = 0.0
-
-    def follow(self, acting: Array, commanded: Sequence[Array]) -> Array:
-        """Return the acting input ``(..., m)`` from the one before and all that were commanded, the latest first."""
-        due = np.zeros_like(acting)
-        for weight, back in self._parts:
-            if back < len(commanded):
-                due = due + weight * commanded[back]
-        return self._followed(acting, due)
-
-    @property
-    def remembered(self) -> int:
-        """The number of commanded inputs that the next one depends on."""
-        return int(self.delay) + 2
-
-    def acting(self, inputs: Array) -> Array:
-        """Return the inputs that act in each step, for commanded ones ``(..., H, m)``."""
-        H, due = inputs.shape[-2], np.zeros_like(inputs)
-        for weight, back in self._parts:
-            due[..., back:, :] += weight * inputs[..., : max(H - back, 0), :]
-        for t in range(H) if self.lag else ():
-            due[..., t, :] = self._followed(due[..., t - 1, :] if t else np.zeros_like(due[..., 0, :]), due[..., t, :])
-        return due
-
-    @property
-    def _parts(self) -> list[tuple[float, int]]:
-        """The weights of the commanded inputs that are due, and how many steps ago they were commanded."""
-        whole, share = int(self.delay), self.delay % 1.0
-        return [(weight, back) for weight, back in ((1.0 - share, whole), (share, whole + 1)) if weight]
-
-    def _followed(self, acting: Array, due: Array) -> Array:
-        return np.asarray(acting + (due - acting) * (1 - np.exp(-1 / self.lag)) if self.lag else due)
 
 
 RecordsOf = Callable[[Actuator], Sequence[Record]]
@@ -144,23 +105,19 @@ def found_actuator(
 
 @dataclass(frozen=True)
 class ActuatedController:
-    """A controller with an actuator, which returns the input that acts and the one that is commanded, ``(..., 2 m)``.
-
-    Its memory has the latest commands, the latest first, and the input that acts.
-    """
+    """A controller with an actuator, whose inputs ``(..., 2 m)`` are those that act and those that are commanded."""
 
     controller: Controller
     actuator: Actuator
 
     def start(self, task: Task) -> Any:
         """Return the memory before the first step."""
-        return memory_of(self.controller, task), (), None
+        return memory_of(self.controller, task), None
 
     def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
         """Return both inputs and the memory after the step."""
-        of_controller, commanded, acting = memory
+        of_controller, of_actuator = memory
         u, of_controller = stepped(self.controller, t, x, of_controller)
         u = np.array(u, dtype=np.float64)
-        commanded = (u, *commanded)[: self.actuator.remembered]
-        acting = self.actuator.follow(np.zeros_like(u) if acting is None else acting, commanded)
-        return np.concatenate([acting, u], axis=-1), (of_controller, commanded, acting)
+        acting, of_actuator = self.actuator.follow(u, of_actuator)
+        return np.concatenate([acting, u], axis=-1), (of_controller, of_actuator)

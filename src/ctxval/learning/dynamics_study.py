@@ -18,7 +18,7 @@ from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
-from ctxval.learning.actuators import Actuator, found_actuator
+from ctxval.learning.actuators import found_actuator
 from ctxval.learning.closed_loops import LoopPlanner, unseen_parameters
 from ctxval.learning.dry_friction import DryFriction, found_friction
 from ctxval.learning.dynamics_posterior import LearnedCovariances, PosteriorSettings, condition, learn_covariances
@@ -33,6 +33,7 @@ from ctxval.learning.regular import split_transitions
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
+from ctxval.systems.actuator import Actuator
 
 _FEWEST_TOLD = 6  # executions from which on a task parameter is suspected of changing the dynamics
 _FEWEST_AGAINST = 3  # executions from which on the data that M was made from may be left out

@@ -28,11 +28,12 @@ from ctxval.core.system import Outputs
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.actuators import ActuatedController, Actuator
+from ctxval.learning.actuators import ActuatedController
 from ctxval.learning.histories import Record
 from ctxval.learning.prediction import Executed
 from ctxval.learning.recorded import closed_loops_on_model, scheduled
 from ctxval.learning.state_estimates import StateEstimates
+from ctxval.systems.actuator import Actuator
 
 
 def with_states_of_model(validation: Validation) -> Validation:

@@ -79,20 +79,28 @@ class Linear:
 def state_space(system: Any, dt: Seconds) -> Linear:
     """Return a ``StateSpace`` of python-control or of scipy as a linear model with its Jacobian.
 
-    The model has the state of the system; C and D are not used. A continuous system, whose own dt is 0 or None, is
-    discretised exactly for inputs that are held over a step. A discrete system whose dt is True has any time step.
+    The model has the state of the system, so C must be the identity and D must be 0, if there are any. A continuous
+    system, whose own dt is 0 or None, is discretised exactly for inputs that are held over a step. A discrete system
+    whose dt is True has any time step.
     """
     if not all(hasattr(system, name) for name in ("A", "B")):
         raise InputError(f"a state-space model must have A and B, got {system!r}.")
     A, B = as_finite("A", system.A), as_finite("B", system.B)
     if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
         raise ShapeError(f"a state-space model needs A (n, n) and B (n, m), got {A.shape} and {B.shape}.")
+    n, m = B.shape
+    C, D = (as_finite(name, getattr(system, name, default)) for name, default in (("C", np.eye(n)), ("D", 0.0)))
+    if not np.array_equal(C, np.eye(n)) or D.any():
+        got = f"C = {C.tolist()} and D = {D.tolist()}"
+        raise InputError(
+            f"C must be the identity and D must be 0, because a model returns states of the system, got {got}: make "
+            "the system of A and B alone, and give outputs=lambda x: x @ C.T to the validation if S records C x."
+        )
     step = getattr(system, "dt", None)
     if not step:
         from scipy.linalg import expm
 
         # For an input that is held over dt: the exponential of [[A, B], [0, 0]] dt.
-        n, m = B.shape
         whole = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * dt)
         return Linear(whole[:n, :n], whole[:n, n:])
     if step is not True and not np.isclose(step, dt, rtol=1e-9, atol=0):

@@ -9,6 +9,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import counted
 from ctxval._util.texts import enumerated
+from ctxval._util.turns import turns
 from ctxval.certificates.bounds import state_of
 from ctxval.core import soundness
 from ctxval.core.distance import ComposedDistance
@@ -152,6 +153,12 @@ def components(context: ReportContext) -> Answer | None:
         f"In the {counted(len(worst), 'worst trial')}, S differs from M most in {label}: by {percent(float(peaks[j]))} "
         f"of its range at the peak, which is at {number(when, 3)} s of {number(end, 3)} s."
     )
+    turn_of_s = turns([run.system.states[:, j] for run in worst])[0]
+    if turn_of_s != turns([run.model.states[:, j] for run in worst])[0]:
+        text += (
+            f" {label} jumps by a whole turn in the loops of {'S' if turn_of_s else 'M'} alone: continue the angle "
+            "over turns, or list it in the angles of the distance."
+        )
     shares = _shares(context, worst)
     numbers = {"state": label, "peak": float(peaks[j]), "time": when, "shares": shares}
     if shares:

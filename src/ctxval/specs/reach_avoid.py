@@ -79,11 +79,16 @@ class ReachAvoid(NamedStates):
         """Return the steps at which the set may be reached."""
         if self.times is None:
             return np.array([task.horizon])
-        first, last = (round(time / task.dt) for time in self.times)
-        if last > task.horizon:
+        first, last = np.array(self.times) / task.dt
+        if last > task.horizon + 1e-6:
             end = task.horizon * task.dt
             raise InputError(f"times must not be after the end of the task at {end:g} s, got {self.times[1]:g} s.")
-        return np.arange(first, last + 1)
+        # A position at a recorded time outside of the window reaches nothing; 1e-6 of a step is rounding.
+        steps = np.arange(np.ceil(first - 1e-6), np.floor(last + 1e-6) + 1, dtype=np.intp)
+        if not len(steps):
+            got = f"{self.times[0]:g} to {self.times[1]:g} s"
+            raise InputError(f"times must contain a recorded time, a multiple of dt = {task.dt:g} s, got {got}.")
+        return steps
 
     @property
     def sets(self) -> tuple[Set, ...]:

@@ -19,6 +19,7 @@ from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ExecutionError, InputError
+from ctxval.systems.actuator import Actuator
 
 Derivative = Callable[[Array, Array], Array]
 
@@ -95,7 +96,8 @@ class Imperfect:
         measurement: standard deviations of the noise of each recorded state.
         resolution: steps to which records are rounded, as an encoder does; 0 for a state that is not rounded.
         delay: steps by which inputs act late; it need not be an integer. Before the first one, the input is 0.
-        lag: time constant of the actuators in steps; 0 if they follow at once.
+        lag: time constant in steps with which the actuators approach the input; 0 if they follow at once. The mean over
+            a step acts in it.
         seed: with a seed, noise is a function of it, of the task and of how often this object has executed.
     """
 
@@ -133,7 +135,7 @@ class Imperfect:
             rng = np.random.default_rng([self.seed, of_task, self._executed])
         if self.start.any():
             start = start + self.start * rng.standard_normal(start.shape)
-        truth, late, acting = start, list[Array](), np.zeros(())
+        actuator, truth, memory = Actuator(self.delay, self.lag), start, None
 
         def record(x: Array) -> Array:
             read = x + self.measurement * rng.standard_normal(x.shape) if self.measurement.any() else x
@@ -141,14 +143,8 @@ class Imperfect:
             return np.asarray(np.where(self.resolution > 0, np.round(read / unit) * unit, read))
 
         def step(_: Array, u: Array) -> Array:
-            nonlocal truth, acting
-            late.append(np.array(u))
-            share = self.delay % 1.0
-            newer, older = (len(late) - 1 - int(self.delay) - back for back in (0, 1))
-            u = sum(w * late[k] for w, k in ((1 - share, newer), (share, older)) if w and k >= 0) + np.zeros(u.shape)
-            if self.lag:
-                u = acting + (u - acting) * (1 - np.exp(-1 / self.lag))
-                acting = u
+            nonlocal truth, memory
+            u, memory = actuator.follow(np.array(u), memory)
             truth = self.model.step(truth, u)
             if self.process.any():
                 truth = truth + self.process * rng.standard_normal(truth.shape)

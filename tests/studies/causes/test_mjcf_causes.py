@@ -9,6 +9,7 @@ from ctxval import Campaign, Parameters, Task, TaskSpace, Validation, controller
 from ctxval.studies import causes
 from ctxval.studies.causes import CauseReport, Joint, find_causes
 from ctxval.studies.causes.cause import plant_of
+from ctxval.studies.causes.flow import Flow
 from rig_thorough import more
 
 pytest.importorskip("mujoco")
@@ -72,7 +73,7 @@ def test_a_changed_copy_leaves_the_model_as_it_is() -> None:
 def test_the_load_of_the_gears_is_what_the_motor_and_gravity_push_against() -> None:
     model, angles, torques = models.MuJoCo(mjcf(), dt=DT), np.array([0.4, -0.9, np.nan]), np.array([0.5, -0.2, 0.1])
     friction = causes.LoadFriction((0.5, 0.01), Joint(1, 0, 1.0, 0, 0), 0.1, DT)
-    load = friction.load(model, np.stack([angles, 0 * angles], axis=-1), torques[:, None])
+    load = friction.load(Flow.of(model, np.stack([angles, 0 * angles], axis=-1), torques[:, None]))
     needed = 0.5 * 9.81 * 0.25 * np.sin(angles)  # to hold the link against gravity
     np.testing.assert_allclose(load, np.abs(torques + needed), rtol=1e-6)
     # A link at rest that friction can hold stays at rest.

@@ -23,12 +23,14 @@ from ctxval.studies.causes.signals import (
     InputGain,
     InputOffset,
     Lag,
+    ObservationDelay,
     ReversedInput,
     Saturation,
     SensorOffset,
     SensorScale,
     SwappedInputs,
     SwappedJoints,
+    WrappedAngle,
 )
 
 __all__ = [
@@ -49,6 +51,7 @@ __all__ = [
     "Lag",
     "LoadFriction",
     "MassCentre",
+    "ObservationDelay",
     "Repaired",
     "ReversedInput",
     "Saturation",
@@ -59,5 +62,6 @@ __all__ = [
     "SwappedJoints",
     "TimeStep",
     "Viscous",
+    "WrappedAngle",
     "find_causes",
 ]

@@ -7,6 +7,7 @@ for those that are commanded, the next state, or what is recorded of a state.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -16,11 +17,12 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
-from ctxval.core.model import Model
+from ctxval.core.model import Model, paired
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.models import MuJoCo
+from ctxval.studies.causes.flow import Flow, Linearisation
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Joint(ShortRepr):
 
     rate: int  #: index of the state
     position: int | None = None  #: index of the state whose derivative it is; None if no state is
-    share: float = 0.5  #: the weight of the rate at the end of a step in the change of the position
+    share: float = 0.5  #: weight of the rate at the end of a step in the change of the position; 0.5 is exact
     input: int | None = None  #: index of the input that drives the joint; None if no input does
     dof: int | None = None  #: index of the degree of freedom of a MuJoCo model; None for other models
 
@@ -95,29 +97,30 @@ def plant_of(model: Model, dt: float, states: dict[str, str], inputs: dict[str, 
             if kind in (2, 3)  # slides and hinges
         )
     else:
-        joints = _joints(dt, x, reached)
+        joints = _joints(dt, x, Flow.of(model, x, u).d / dt)
         ports = tuple(_ports(model, x, u, reached, commanded, joints))
     names = list(states.items()), list(inputs.items())
     return Plant(model, dt, *names, joints, ports, np.maximum(changes, 1e-12), commanded)
 
 
-def _joints(dt: float, x: Array, reached: Array) -> tuple[Joint, ...]:
-    """Return the rates, each with the position whose derivative it is; each state is a rate if none is a position."""
-    n = x.shape[1]
-    change = (reached - x) / dt
+def _joints(dt: float, x: Array, change: Array) -> tuple[Joint, ...]:
+    """Return the rates, each with the position whose derivative it is; each state is a rate if none is a position.
+
+    The derivatives ``change`` are those at the states x, both ``(N, n)``.
+    """
     pairs: dict[int, tuple[int, float]] = {}
-    for position in range(n):
+    for position in range(x.shape[1]):
         size = float((change[:, position] ** 2).mean())
         errors = []
-        for rate in range(n):
-            left, gained = change[:, position] - x[:, rate], reached[:, rate] - x[:, rate]
-            share = float(np.clip(left @ gained / max(float(gained @ gained), 1e-300), 0.0, 1.0))
-            errors.append((float(((left - share * gained) ** 2).mean()), rate, share))
+        for rate in range(x.shape[1]):
+            left, gained = change[:, position] - x[:, rate], dt * change[:, rate]
+            share = float(np.clip(left @ gained / max(float(gained @ gained), 1e-300), -0.5, 0.5))
+            errors.append((float(((left - share * gained) ** 2).mean()), rate, 0.5 + share))
         error, rate, share = min(errors)
         if rate != position and size > 0 and error < 0.05**2 * size:
             pairs[rate] = position, share
     positions = {position for position, _ in pairs.values()}
-    rates = [i for i in range(n) if i not in positions]
+    rates = [i for i in range(x.shape[1]) if i not in positions]
     return tuple(Joint(i, *pairs[i]) for i in rates if i in pairs) or tuple(map(Joint, rates))
 
 
@@ -157,17 +160,33 @@ class Cause(ShortRepr):
         """Return the cause with other sizes."""
         return replace(self, sizes=tuple(float(size) for size in sizes))
 
+    @property
+    def kind(self) -> Cause:
+        """The cause without its sizes: two causes of one kind are one cause."""
+        return replace(self, sizes=())
+
     def model(self, model: Model) -> Model:
         """Return the model of the mechanics."""
         return model
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        """Return the inputs that act ``(..., m)`` for those of causes before, and a memory; None at the first step."""
+        """Return the inputs that act ``(..., m)`` for those of causes before, and a memory; None at the first step.
+
+        If they change while a step goes on, they are those of its parts ``(..., parts, m)``.
+        """
         return u, memory
 
-    def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
-        """Return the next state ``(..., n)`` for that of the model, ``free``, and that without this cause."""
-        return reached
+    def duration(self, model: Model) -> float:
+        """Return the steps of a model of the mechanics that a step of the system takes."""
+        return 1.0
+
+    def within(self, flow: Flow) -> Flow:
+        """Return the flow of a step for the flow without this cause."""
+        return flow
+
+    def seeing(self, controller: Controller) -> Controller:
+        """Return a controller that sees what this cause lets it see of the records."""
+        return controller
 
     def true(self, recorded: Array) -> Array:
         """Return the states ``(..., n)`` of which these are recorded."""
@@ -176,6 +195,10 @@ class Cause(ShortRepr):
     def recorded(self, x: Array) -> Array:
         """Return what is recorded of states ``(..., n)``."""
         return x
+
+    def gap(self, difference: Array) -> Array:
+        """Return differences of recorded states ``(..., n)`` as they are to be compared."""
+        return difference
 
     def text(self, plant: Plant) -> str:
         """Return what it is with its sizes and units: a clause without a full stop."""
@@ -239,17 +262,25 @@ class Repaired(ShortRepr):
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next recorded states ``(..., n)`` of recorded states; causes that remember are left out."""
+        if x.ndim != u.ndim:
+            x, u = map(np.array, paired(x, u))
         for cause in self.causes:
             u = u if cause.remembers else cause.follow(u, None)[0]
         return self.recorded(self.reached(self.true(x), u))
 
-    def reached(self, x: Array, acting: Array) -> Array:
-        """Return the next states ``(..., n)`` for the inputs that act."""
+    def reached(self, x: Array, acting: Array, at: Linearisation | None = None) -> Array:
+        """Return the next states ``(..., n)`` for the inputs that act; M may be linearised ``at`` states near x."""
+        duration = math.prod(cause.duration(self.mechanics) for cause in self.causes)
+        inside = [cause for cause in self.causes if type(cause).within is not Cause.within]
         with np.errstate(all="ignore"):
-            reached = free = np.asarray(self.mechanics.step(x, acting))
-            for cause in self.causes:
-                reached = cause.pushed(self.mechanics, x, acting, free, reached)
-        return reached
+            while duration > 0:  # whole steps of M, and the rest of one
+                if inside or duration < 1 or acting.ndim > x.ndim:
+                    flow = Flow.of(self.mechanics, x, acting, at)
+                    x = functools.reduce(lambda flow, cause: cause.within(flow), inside, flow).end(min(duration, 1.0))
+                else:
+                    x = np.asarray(self.mechanics.step(x, acting))
+                duration, at = duration - 1, None
+        return x
 
     def true(self, recorded: Array) -> Array:
         """Return the states ``(..., n)`` of which these are recorded."""
@@ -264,15 +295,13 @@ class Repaired(ShortRepr):
         return x
 
     def acting(self, inputs: Array) -> Array:
-        """Return the inputs that act in each step, for commanded ones ``(..., H, m)``."""
+        """Return the inputs that act in each step, for commanded ones ``(..., H, m)``; see :meth:`Cause.follow`."""
+        acting = list(np.moveaxis(inputs, -2, 0))
         for cause in self.causes:
-            if cause.remembers:
-                memory, commanded, inputs = None, inputs, np.empty_like(inputs)
-                for t in range(inputs.shape[-2]):
-                    inputs[..., t, :], memory = cause.follow(commanded[..., t, :], memory)
-            else:
-                inputs, _ = cause.follow(inputs, None)
-        return inputs
+            memory = None
+            for t, u in enumerate(acting):
+                acting[t], memory = cause.follow(u, memory)
+        return np.stack(acting, axis=inputs.ndim - 2)
 
     def execute(self, controller: Controller, task: Task, noise: Array | None = None) -> Trajectory:
         """Return the closed loop with all causes; the controller acts on what is recorded.
@@ -291,4 +320,6 @@ class Repaired(ShortRepr):
             truth = self.reached(truth, u)
             return self.recorded(truth) + next(added, 0.0)
 
+        for cause in self.causes:
+            controller = cause.seeing(controller)
         return rollout(step, controller, task)

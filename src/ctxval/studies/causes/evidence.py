@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,7 +13,8 @@ from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
-from ctxval.studies.causes.cause import CauseCandidate, Repaired
+from ctxval.studies.causes.cause import Cause, CauseCandidate, Repaired
+from ctxval.studies.causes.flow import Linearisation
 
 STEPS = (1, 6)  # of the predictions
 _LARGEST = 1e3  # of a residual, as a multiple of the typical one of M
@@ -35,6 +37,7 @@ class Evidence:
     """Recorded executions, and what M misses in them: residuals of sizes ``(n,)`` after one step and after several.
 
     The states ``(N + k, n)`` are of all k runs, one after the other, and inputs ``(k, H, m)`` are padded with zeros.
+    Causes that are known say how states are compared.
     """
 
     def __init__(
@@ -44,8 +47,9 @@ class Evidence:
         floors: Sequence[Array] | None = None,
         most: tuple[int, int] = (600, 120),
         steps: tuple[int, int] = STEPS,
+        known: tuple[Cause, ...] = (),
     ) -> None:
-        self.model, self.horizons = model, [len(run.inputs) for run in runs]
+        self.model, self.known, self.horizons = model, known, [len(run.inputs) for run in runs]
         self.states = np.concatenate([run.states for run in runs])
         self.inputs = np.zeros((len(runs), max(self.horizons), runs[0].inputs.shape[1]))
         for padded, run in zip(self.inputs, runs, strict=True):
@@ -55,7 +59,7 @@ class Evidence:
         for number, length in enumerate(steps):
             window = self._window(min(length, min(self.horizons)), most[number])
             left = self.left_by(Repaired(model, ()), window)
-            changes = _size(self.states[window.states + window.steps] - self.states[window.states])
+            changes = _size(self._gap(self.states[window.states + window.steps] - self.states[window.states]))
             # Smaller residuals are no evidence.
             least = np.hypot(0.01 * _size(left), 1e-3 * changes) if floors is None else floors[number]
             self.windows.append(replace(window, floors=np.maximum(least, 1e-15)))
@@ -80,13 +84,27 @@ class Evidence:
         inputs = self.inputs.reshape(-1, self.inputs.shape[-1])
         return self.states[window.states], inputs[window.inputs], residuals
 
+    @functools.cached_property
+    def linearised(self) -> Linearisation:
+        """M at all recorded states."""
+        rows = [np.arange(horizon + 1) + k * self.inputs.shape[1] for k, horizon in enumerate(self.horizons)]
+        inputs = self.inputs.reshape(-1, self.inputs.shape[-1])
+        with np.errstate(all="ignore"):
+            return Linearisation.of(self.model, self.states, inputs[np.minimum(np.concatenate(rows), len(inputs) - 1)])
+
     def left_by(self, repaired: Repaired, window: Predictions, moved: Array | float = 0.0) -> Array:
         """Return predicted minus recorded states ``(N, n)``; predictions begin at recorded states that are moved."""
-        acting = repaired.acting(self.inputs).reshape(-1, self.inputs.shape[-1])
+        acting = repaired.acting(self.inputs)
+        acting = acting.reshape(-1, *acting.shape[2:])
         x = repaired.true(self.states[window.states] + moved)
+        moved_back = any(type(cause).true is not Cause.true for cause in repaired.causes)
         for k in range(window.steps):
-            x = repaired.reached(x, acting[window.inputs + k])
-        return np.asarray(repaired.recorded(x) - self.states[window.states + window.steps])
+            at = None if moved_back else self.linearised[window.states + k]
+            x = repaired.reached(x, acting[window.inputs + k], at)
+        return self._gap(repaired.recorded(x) - self.states[window.states + window.steps])
+
+    def _gap(self, difference: Array) -> Array:
+        return functools.reduce(lambda difference, cause: cause.gap(difference), self.known, difference)
 
     def noise(self, repaired: Repaired) -> Array:
         """Return the standard deviations ``(n,)`` of white noise of measurements, as residuals of one step show it."""
@@ -116,7 +134,7 @@ class Evidence:
     def _explained(self, repaired: Repaired, noise: Array, steps: int) -> tuple[float, float]:
         window, rng = self._window(steps, len(self.states)), np.random.default_rng(0)
         if steps not in self._missed:
-            changes = _size(self.states[window.states + steps] - self.states[window.states])
+            changes = _size(self._gap(self.states[window.states + steps] - self.states[window.states]))
             missed = _size(self.left_by(Repaired(self.model, ()), window))
             self._missed[steps] = missed, missed > 2e-3 * np.maximum(changes, 1e-12)
         sizes, matter = self._missed[steps]

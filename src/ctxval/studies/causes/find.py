@@ -13,7 +13,7 @@ from ctxval._util.progress import advance, stage
 from ctxval._util.representation import ShortRepr
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import at_points, executed_trials
-from ctxval.core.plan import Plan
+from ctxval.core.plan import Plan, observation_delay
 from ctxval.core.system import System, WithOutputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
@@ -22,7 +22,7 @@ from ctxval.errors import CtxvalError, DistanceError, InputError
 from ctxval.learning.extended import estimates_by_loops_on_model
 from ctxval.models import MuJoCo
 from ctxval.studies.causes import mechanics, signals
-from ctxval.studies.causes.cause import CauseCandidate, Plant, Repaired, of_size, plant_of
+from ctxval.studies.causes.cause import Cause, CauseCandidate, Plant, Repaired, of_size, plant_of
 from ctxval.studies.causes.evidence import STEPS, Evidence, Explanation, explained, screened
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
 
@@ -188,12 +188,20 @@ class _Study:
         self.validation, self.executions, self.model = validation, executions, validation.model
         self.outputs = validation.outputs is not None
         horizon = min(len(run.inputs) for run in runs)
+        # What inputs and jumps of the records tell is known, and not fitted.
+        old = observation_delay([(each.plan.controller, each.plan.task, each.executed) for each in executions])
+        late = [CauseCandidate(signals.ObservationDelay(steps=old))] if old else []
+        with np.errstate(all="ignore"):
+            following = [np.asarray(self.model.step(*map(np.array, (run.states[:-1], run.inputs)))) for run in runs]
+        self.known = (*late, *signals.wrapped_angles([run.states for run in runs], following))
+        known = tuple(each.cause for each in self.known)
         # Estimated states are worth little in one step.
         steps = (max(1, horizon // 60), max(1, horizon // 12)) if self.outputs else STEPS
-        self.evidence = Evidence(self.model, runs, steps=steps)
+        self.evidence = Evidence(self.model, runs, steps=steps, known=known)
         floors = [window.floors for window in self.evidence.windows]
-        self.some = Evidence(self.model, runs, floors, (200, 40), steps)  # all causes are screened on these
-        self.others = [Evidence(self.model, runs[:k] + runs[k + 1 :], floors, steps=steps) for k in range(len(runs))]
+        self.some = Evidence(self.model, runs, floors, (200, 40), steps, known)  # all causes are screened on these
+        without = (runs[:k] + runs[k + 1 :] for k in range(len(runs)))
+        self.others = [Evidence(self.model, rest, floors, steps=steps, known=known) for rest in without]
         x, u, residuals = self.evidence.pairs
         usable = np.isfinite(residuals).all(axis=1)
         if not usable.any():
@@ -205,19 +213,26 @@ class _Study:
         self.before = max(self.loops.distances)
 
     def report(self, most: int) -> CauseReport:
-        from_start = None if self.outputs else self._in_closed_loop(Explanation((), Repaired(self.model, ()), 0.0, 1.0))
-        if from_start is not None and from_start.complete >= _NAMED:
+        first = None
+        if self.known or not self.outputs:
+            known = Repaired(self.model, tuple(each.cause for each in self.known))
+            first = self._in_closed_loop(Explanation(self.known, known, 0.0, 1.0))
+        if first is not None and first.complete >= _NAMED:
+            if self.known:
+                return self._reported([first], [], False)
             offset = self._offset_of_starts()
-            return self._reported([] if offset is None else [replace(from_start, explanation=offset)], [], True)
+            return self._reported([] if offset is None else [replace(first, explanation=offset)], [], True)
         with stage("fitting causes", (2 * most - 1) * len(self.dictionary), "causes"):
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
-            while chosen is not None and chosen.counts(self.before) and len(chosen.explanation.candidates) < most:
+            while chosen is not None and chosen.counts(self.before) and len(self._fitted(chosen)) < most:
                 if chosen.explanation.left < 0.02 or chosen.complete > 0.99:  # nothing is left for another cause
                     break
-                better, others = self._chosen(self._ranked(chosen.explanation.candidates))
+                better, others = self._chosen(self._ranked(self._fitted(chosen)))
                 if better is not None:  # the first one was chosen without the other ones
-                    better, others = self._chosen(self._ranked(better.explanation.candidates[1:]))
+                    better, others = self._chosen(self._ranked(self._fitted(better)[1:]))
+                if better is not None and _unsized(self._fitted(better)[-1]) != _unsized(self._fitted(chosen)[0]):
+                    better, others = self._chosen(self._ranked(self._fitted(better)[1:]))
                 if better is None or not better.counts(self.before):
                     break
                 if better.explanation.criterion > chosen.explanation.criterion - _ALIKE:
@@ -225,7 +240,12 @@ class _Study:
                 if 1 - better.complete > 0.5 * (1 - chosen.complete):
                     break
                 chosen, alike = better, others
+        if chosen is None and first is not None and self.known:
+            chosen, alike = first, []
         return self._reported([] if chosen is None else [chosen, *alike], ranked, False)
+
+    def _fitted(self, chosen: Explained) -> tuple[CauseCandidate, ...]:
+        return chosen.explanation.candidates[len(self.known) :]
 
     def _reported(self, group: list[Explained], ranked: list[Explanation], began_elsewhere: bool) -> CauseReport:
         named = bool(group) and group[0].counts(self.before) and group[0].complete >= _NAMED
@@ -259,18 +279,23 @@ class _Study:
 
     def _ranked(self, beside: tuple[CauseCandidate, ...]) -> list[Explanation]:
         """Return explanations by each cause beside given ones, the most probable first; the best of a screening."""
-        kinds = [each.cause.with_sizes(()) for each in beside]
+        kinds = [each.cause.kind for each in beside]
         results = []
         for each in self.dictionary:
-            if each.cause.with_sizes(()) not in kinds:
-                together = (*beside, each)
+            together = (*self.known, *beside, each)
+            within = [other for other in together if not getattr(other.cause, "held", True)]
+            if each.cause.kind not in kinds and len(within) < 2:
                 results.append((*screened(self.some, together), together))
             advance(1)
         results.sort(key=lambda result: result[0])
         # What comes to less than a quarter of the evidence of the best one is not worth a fit.
         worth = [result for result in results[:_FITTED] if result[0] <= 0.25 * results[0][0]]
         refined = [explained(self.evidence, together, begun) for _, begun, together in worth or results[:1]]
-        return sorted(refined, key=lambda explanation: explanation.criterion)
+        distinct = list[Explanation]()
+        for each in sorted(refined, key=lambda explanation: explanation.criterion):
+            if not any(_is_same(each, other) for other in distinct):
+                distinct.append(each)
+        return distinct
 
     def _chosen(self, ranked: list[Explanation]) -> tuple[Explained | None, list[Explained]]:
         """Return the most probable explanation that counts, and those that the executions do not tell from it.
@@ -292,6 +317,7 @@ class _Study:
         most_left = 1.3 * left + 2e-4 if left < 0.02 else -np.inf
         alike = [each for each in ranked if each.criterion < most_probable + _ALIKE or each.left < most_left]
         others = [each for each in alike if each is not best.explanation]
+        others.sort(key=lambda each: len(each.sizes))  # the simplest are tried first
         group = [best, *(self._in_closed_loop(each) for each in others[:_CHECKED])]
         group = [each for each in group if 1 - each.share <= 2 * (1 - best.share) + 1e-3]
         first = min((each for each in group if each.counts(self.before)), key=lambda each: len(each.explanation.sizes))
@@ -348,9 +374,19 @@ def candidates(plant: Plant, x: Array, u: Array, residuals: Array, *, outputs: b
         *signals.of_inputs(plant),
         *(candidate for joint in plant.ports for candidate in mechanics.forces(plant, joint, x, u, missed)),
         *(mechanics.of_mujoco(plant, missed) if isinstance(plant.model, MuJoCo) else mechanics.of_joints(plant)),
-        of_size(mechanics.TimeStep((1.0,)), 0.2, 5.0, 0.1, 0.95, 1.05),
+        of_size(mechanics.TimeStep((1.0,)), 0.2, 5.0, 0.1, 0.5, 0.95, 1.05, 2.0),
         *(() if outputs else signals.of_sensors(plant, x)),  # states that are estimated have no sensors
     )
+
+
+def _unsized(candidate: CauseCandidate) -> Cause:
+    return replace(candidate.cause, sizes=())
+
+
+def _is_same(explanation: Explanation, other: Explanation) -> bool:
+    """Return whether causes of the same kinds have the same sizes: in fine sampling, a delay may be held or not."""
+    kinds = [[cause.kind for cause in each.repaired.causes] for each in (explanation, other)]
+    return kinds[0] == kinds[1] and np.allclose(explanation.sizes, other.sizes, rtol=0.02)
 
 
 def _contains(general: Explained, special: Explained) -> bool:

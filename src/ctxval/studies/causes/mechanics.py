@@ -3,49 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, rows_of
 from ctxval.core.model import Model
+from ctxval.models import MuJoCo
 from ctxval.studies.causes.cause import Cause, CauseCandidate, Joint, Plant, of_ratio, of_size
+from ctxval.studies.causes.flow import Flow
 
 
 @dataclass(frozen=True)
 class Force(Cause):
-    """A force on a joint, in units of its input, of MuJoCo, or of an acceleration; held over a step."""
+    """A force on a joint, in units of its input, of MuJoCo, or of an acceleration, which acts while a step goes on."""
 
     joint: Joint = Joint(0)  # noqa: RUF009  # where it enters; it is frozen
     probe: float = 1.0  #: a force that is typical of the joint, with which its effect in M is measured
     dt: float = 1.0  #: seconds
 
-    def effect(self, model: Any, x: Array, u: Array, free: Array) -> Array:
-        """Return the change of the next state ``free`` of the model by one unit of the force, shape ``(..., n)``."""
+    def drive(self, flow: Flow) -> Array:
+        """Return the change of the state by one unit of the force in a step of M, in units of ``flow.d``."""
+        model, x, u = flow.model, flow.start, flow.inputs
         if self.joint.dof is not None:  # of a model of MuJoCo
-            forces = np.zeros(model.compiled.nv)
-            forces[self.joint.dof] = self.probe
-            return np.asarray((model.changed(forces=forces).step(x, u) - free) / self.probe)
+            forces = self.probe * np.eye(model.compiled.nv)[self.joint.dof]  # type: ignore[attr-defined]
+            pushed = model.changed(forces=forces).step(x, u)  # type: ignore[attr-defined]
+            return flow.driven((pushed - flow.reached) / self.probe)
         if self.joint.input is not None:
-            moved = np.array(u)
-            moved[..., self.joint.input] += self.probe
-            return (np.asarray(model.step(x, moved)) - free) / self.probe
-        return _accelerated(np.zeros_like(x), [self.joint], np.full_like(x, self.dt), self.dt)
+            moved = u + self.probe * np.eye(u.shape[-1])[self.joint.input]
+            return flow.driven((np.asarray(model.step(x, moved)) - flow.reached) / self.probe)
+        accelerated = _accelerations(x.shape[-1], [self.joint], self.dt)[:, self.joint.rate]
+        return np.broadcast_to(self.dt * accelerated, x.shape)
 
-    def force(self, rate: Array, load: Array, stopping: Array) -> Array:
+    def force(self, rate: Array, load: Array | float, stopping: Array) -> Array:
         """Return the force ``(...)`` at a rate, a load of the gears, and a force that would stop the joint."""
         raise NotImplementedError
 
-    def load(self, model: Any, x: Array, u: Array) -> Array:
-        """Return the magnitude of the force that the gears carry ``(...)``; 0 if the force does not depend on it."""
-        return np.zeros(x.shape[:-1])
+    def load(self, flow: Flow) -> Array | float:
+        """Return the magnitude of the force that the gears carry ``(...)`` when a step begins, if it matters."""
+        return 0.0
 
-    def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
-        effect, number = self.effect(model, x, u, free), self.joint.rate
-        moving = np.where(np.abs(effect[..., number]) > 1e-12, effect[..., number], 1e-12)
-        rate = 0.5 * (x[..., number] + reached[..., number])
-        return reached + effect * self.force(rate, self.load(model, x, u), -reached[..., number] / moving)[..., None]
+    def within(self, flow: Flow) -> Flow:
+        load = self.load(flow)
+        push = self.drive(flow), self.joint.rate, lambda rate, stopping: self.force(rate, load, stopping)
+        return replace(flow, pushes=(*flow.pushes, push))
 
     def amount(self, plant: Plant, size: float) -> str:
         return f"{size:.3g} {plant.force_unit(self.joint)}"
@@ -57,7 +59,7 @@ class Bias(Force):
 
     name: ClassVar[str] = "bias"
 
-    def force(self, rate: Array, load: Array, stopping: Array) -> Array:
+    def force(self, rate: Array, load: Array | float, stopping: Array) -> Array:
         return np.full_like(stopping, self.sizes[0])
 
     def text(self, plant: Plant) -> str:
@@ -70,12 +72,14 @@ class Viscous(Force):
 
     name: ClassVar[str] = "viscous friction"
 
-    def force(self, rate: Array, load: Array, stopping: Array) -> Array:
-        return -self.sizes[0] * rate
+    def within(self, flow: Flow) -> Flow:
+        drive, rate = self.sizes[0] * self.drive(flow), self.joint.rate
+        A = np.array(np.broadcast_to(flow.A, (*drive.shape, drive.shape[-1])))
+        A[..., rate] -= drive
+        return replace(flow, A=A, d=flow.d - drive * flow.start[..., rate, None])
 
     def text(self, plant: Plant) -> str:
-        rate = plant.rate_unit(self.joint)
-        more = "more" if self.sizes[0] >= 0 else "less"
+        rate, more = plant.rate_unit(self.joint), "more" if self.sizes[0] >= 0 else "less"
         size = self.amount(plant, abs(self.sizes[0])) + (f" per {rate}" if rate else "")
         return f"{plant.joint_name(self.joint)} has {more} viscous friction than M ({size})"
 
@@ -86,7 +90,7 @@ class Coulomb(Force):
 
     name: ClassVar[str] = "Coulomb friction"
 
-    def force(self, rate: Array, load: Array, stopping: Array) -> Array:
+    def force(self, rate: Array, load: Array | float, stopping: Array) -> Array:
         return np.clip(stopping, -self.sizes[0], self.sizes[0])
 
     def text(self, plant: Plant) -> str:
@@ -103,7 +107,7 @@ class Stribeck(Force):
 
     name: ClassVar[str] = "Stribeck friction"
 
-    def force(self, rate: Array, load: Array, stopping: Array) -> Array:
+    def force(self, rate: Array, load: Array | float, stopping: Array) -> Array:
         sliding, added, slow = self.sizes
         most = sliding + added * np.exp(-((rate / max(slow, 1e-12)) ** 2))
         return np.clip(stopping, -most, most)
@@ -125,31 +129,32 @@ class LoadFriction(Force):
     name: ClassVar[str] = "load-dependent friction"
     rates: tuple[int, ...] = ()  #: the rates of all joints that inputs drive
 
-    def load(self, model: Any, x: Array, u: Array) -> Array:
+    def load(self, flow: Flow) -> Array:
+        model, x, u = flow.model, flow.start, flow.inputs
         if self.joint.dof is not None:  # the force of the actuators minus what pulls, by the dynamics of MuJoCo
             import mujoco
 
-            states, inputs, nq = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1]), model.compiled.nq
-            data, pulls = mujoco.MjData(model.compiled), np.full(len(states), np.nan)
+            compiled: Any = model.compiled  # type: ignore[attr-defined]
+            states, inputs, nq = rows_of(x), rows_of(u), compiled.nq
+            data, pulls = mujoco.MjData(compiled), np.full(len(states), np.nan)
             for k in np.flatnonzero(np.isfinite(states).all(axis=1)):
                 data.qpos, data.qvel, data.ctrl = states[k, :nq], states[k, nq:], inputs[k]
-                mujoco.mj_forward(model.compiled, data)
+                mujoco.mj_forward(compiled, data)
                 pulls[k] = (data.qfrc_actuator + data.qfrc_bias)[self.joint.dof]
             return np.asarray(np.abs(pulls).reshape(x.shape[:-1]))
-        unmoved, m = np.asarray(model.step(x, np.zeros_like(u))), u.shape[-1]
+        resting, m = np.asarray(model.step(x, np.zeros_like(u))), u.shape[-1]
+        pulled = flow.driven(resting - x)
         if self.joint.input is None:
-            number = self.joint.rate
-            driven = np.asarray(model.step(x, u))[..., number] - unmoved[..., number]
-            return np.asarray(np.abs(driven - (unmoved - x)[..., number]) / self.dt)
+            return np.asarray(np.abs(flow.d - 2 * pulled)[..., self.joint.rate] / self.dt)
         # What pulls is as large as the motors' forces that would do the same: each of them moves all joints.
         rates, probes = list(self.rates), self.probe * np.eye(m)
-        moved = np.stack([np.asarray(model.step(x, np.broadcast_to(each, u.shape))) for each in probes], axis=-1)
-        effects = ((moved - unmoved[..., None]) / self.probe)[..., rates, :]
+        moved = (np.asarray(model.step(x, np.zeros_like(u) + each)) for each in probes)
+        effects = np.stack([flow.driven(each - resting)[..., rates] / self.probe for each in moved], axis=-1)
         effects = np.nan_to_num(effects, nan=0.0, posinf=0.0, neginf=0.0)  # a step of M may have failed
-        pulls = u - (np.linalg.pinv(effects) @ (unmoved - x)[..., rates, None])[..., 0]
+        pulls = u - (np.linalg.pinv(effects) @ pulled[..., rates, None])[..., 0]
         return np.asarray(np.abs(pulls[..., self.joint.input]))
 
-    def force(self, rate: Array, load: Array, stopping: Array) -> Array:
+    def force(self, rate: Array, load: Array | float, stopping: Array) -> Array:
         most = self.sizes[0] * load + self.sizes[1]
         return np.clip(stopping, -most, most)
 
@@ -159,14 +164,14 @@ class LoadFriction(Force):
         return f"the friction of {name} depends on the load ({100 * self.sizes[0]:.3g} % of it{more})"
 
 
-def _accelerated(reached: Array, joints: Sequence[Joint], gained: Array, dt: float) -> Array:
-    """Return next states ``(..., n)`` in which the rates of joints have changed, and their positions accordingly."""
-    changed = np.array(reached)
+def _accelerations(n: int, joints: Sequence[Joint], dt: float) -> Array:
+    """Return the part ``(n, n)`` of derivatives that accelerations of joints make, as M integrates."""
+    part = np.zeros((n, n))
     for joint in joints:
-        changed[..., joint.rate] += gained[..., joint.rate]
+        part[joint.rate, joint.rate] = 1.0
         if joint.position is not None:
-            changed[..., joint.position] += joint.share * dt * gained[..., joint.rate]
-    return changed
+            part[joint.position, joint.rate] = (joint.share - 0.5) * dt
+    return part
 
 
 @dataclass(frozen=True)
@@ -177,8 +182,11 @@ class Inertia(Cause):
     joints: tuple[Joint, ...] = ()  #: those whose accelerations are divided by the size
     dt: float = 1.0  #: seconds
 
-    def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
-        return _accelerated(reached, self.joints, (1.0 / self.sizes[0] - 1.0) * (reached - x), self.dt)
+    def within(self, flow: Flow) -> Flow:
+        n = flow.start.shape[-1]
+        divided = np.eye(n) + (1.0 / self.sizes[0] - 1.0) * _accelerations(n, self.joints, self.dt)
+        pushes = tuple((drive @ divided.T, rate, force) for drive, rate, force in flow.pushes)
+        return replace(flow, A=divided @ flow.A, d=flow.d @ divided.T, varied=flow.varied @ divided.T, pushes=pushes)
 
     def text(self, plant: Plant) -> str:
         names = " and ".join(map(plant.joint_name, self.joints))
@@ -194,11 +202,14 @@ class Gravity(Cause):
     rates: tuple[int, ...] = ()  #: indices of all states that are 0 at rest
     dt: float = 1.0  #: seconds
 
-    def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
-        still = np.array(x)
-        still[..., list(self.rates)] = 0.0
-        pulled = (self.sizes[0] - 1.0) * np.asarray(model.step(still, np.zeros_like(u)))
-        return _accelerated(reached, self.joints, pulled, self.dt)
+    def within(self, flow: Flow) -> Flow:
+        resting, n = np.array(flow.start), flow.start.shape[-1]
+        resting[..., list(self.rates)] = 0.0
+        pulled = flow.driven(np.asarray(flow.model.step(resting, np.zeros_like(flow.inputs))) - resting)
+        more = (self.sizes[0] - 1.0) * _accelerations(n, self.joints, self.dt)
+        by_positions = np.delete(np.eye(n), self.rates, axis=0)
+        slopes = more @ flow.A @ (by_positions.T @ by_positions)
+        return replace(flow, A=flow.A + slopes, d=flow.d + pulled @ more.T)
 
     def text(self, plant: Plant) -> str:
         names = " and ".join(map(plant.joint_name, self.joints))
@@ -211,8 +222,20 @@ class TimeStep(Cause):
 
     name: ClassVar[str] = "time step"
 
-    def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
-        return x + self.sizes[0] * (reached - x)
+    def duration(self, model: Model) -> float:
+        return 1.0 if isinstance(model, MuJoCo) else self.sizes[0]
+
+    def model(self, model: Model) -> Model:
+        if not isinstance(model, MuJoCo):
+            return model
+        substeps = max(1, round(self.sizes[0] * model.substeps))
+
+        def change(compiled: Any) -> None:
+            compiled.opt.timestep *= self.sizes[0] * model.substeps / substeps
+
+        changed = model.changed(change)
+        changed.substeps = substeps
+        return changed
 
     def text(self, plant: Plant) -> str:
         step, taken = 1e3 * plant.dt, 1e3 * plant.dt * self.sizes[0]
@@ -228,8 +251,7 @@ class OfMuJoCo(Cause):
         raise NotImplementedError
 
     def model(self, model: Any) -> Model:
-        changed: Model = model.changed(self.change)
-        return changed
+        return model.changed(self.change)  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True)
@@ -308,9 +330,7 @@ def forces(plant: Plant, joint: Joint, x: Array, u: Array, missed: Array) -> Ite
     """Yield the forces that may enter at a place, in sizes whose effects are as large as what M misses of its rate."""
     probe = 0.1 * float(plant.commanded[joint.input]) if joint.input is not None and joint.dof is None else 1.0
     rows = slice(None, None, max(1, len(x) // 50))
-    free = np.asarray(plant.model.step(x[rows], u[rows]))
-    unit = Bias((1.0,), joint, probe, plant.dt)
-    effects = unit.effect(plant.model, x[rows], u[rows], free)[:, joint.rate]
+    effects = Bias((1.0,), joint, probe, plant.dt).drive(Flow.of(plant.model, x[rows], u[rows]))[:, joint.rate]
     effects = effects[np.isfinite(effects)]
     size = float(np.sqrt((effects**2).mean())) if len(effects) else 0.0
     force = float(missed[joint.rate]) / size if size > 0 else 0.0
@@ -367,8 +387,7 @@ def of_mujoco(plant: Plant, missed: Array) -> Iterator[CauseCandidate]:
             starts = (0.3 * size, size) if attribute == "frictionloss" else (0.0,)
             # More damping would make the integration unstable.
             most = min(20 * size, inertia / compiled.opt.timestep) if attribute == "damping" else 20 * size
-            cause = JointAttribute((0.0,), attribute, joint)
-            yield of_size(cause, low, most, 0.05 * size, *starts)
+            yield of_size(JointAttribute((0.0,), attribute, joint), low, most, 0.05 * size, *starts)
     masses = compiled.body_mass
     moved = (compiled.body_dofnum > 0) | (compiled.body_parentid > 0)
     bodies = [body for body in range(1, compiled.nbody) if masses[body] > 0 and moved[body]]
@@ -376,5 +395,4 @@ def of_mujoco(plant: Plant, missed: Array) -> Iterator[CauseCandidate]:
         yield of_ratio(BodyMass((1.0,), body))
         extent = float(np.sqrt(compiled.body_inertia[body].max() / masses[body]))
         for axis in range(3 if extent > 0 else 0):
-            moved_centre = MassCentre((0.0,), body, axis)
-            yield of_size(moved_centre, -3 * extent, 3 * extent, 0.05 * extent, 0.0)
+            yield of_size(MassCentre((0.0,), body, axis), -3 * extent, 3 * extent, 0.05 * extent, 0.0)

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.learning.actuators import Actuator
+from ctxval._util.representation import counted
+from ctxval._util.turns import turns
+from ctxval.core.controller import Controller, memory_of, stepped
+from ctxval.core.model import Function, Model
+from ctxval.core.task import Task
 from ctxval.studies.causes.cause import Cause, CauseCandidate, Plant, of_ratio, of_size
+from ctxval.studies.causes.flow import PARTS
+from ctxval.systems.actuator import Actuator
 
 
 def _at(values: Array, index: int | list[int] | None, size: float, elsewhere: float = 0.0) -> Array:
@@ -138,36 +144,89 @@ class ReversedInput(OfInput):
 
 
 @dataclass(frozen=True)
-class Delay(Cause):
-    """All inputs act late. Size: the delay in steps, which need not be an integer. Before the first input, 0 acts."""
+class Late(Cause):
+    """All inputs act late. Before the first input, 0 acts."""
 
-    name: ClassVar[str] = "delay"
     remembers: ClassVar[bool] = True
+    held: bool = True  #: whether the mean over a step acts in it, as in :class:`ctxval.systems.Imperfect`
+
+    @property
+    def actuator(self) -> Actuator:
+        """What the inputs pass."""
+        raise NotImplementedError
+
+    @property
+    def kind(self) -> Cause:
+        return replace(self, sizes=(), held=True)
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        actuator = Actuator(delay=max(self.sizes[0], 0.0))
-        commanded = (u, *(memory or ()))[: actuator.remembered]
-        return actuator.follow(np.zeros_like(u), commanded), commanded
-
-    def text(self, plant: Plant) -> str:
-        return f"commands arrive {_duration(plant.dt * self.sizes[0])} late ({self.sizes[0]:.3g} steps)"
+        return self.actuator.follow(u, memory, 1 if self.held else PARTS)
 
 
 @dataclass(frozen=True)
-class Lag(Cause):
+class Delay(Late):
+    """All inputs act late. Size: the delay in steps, which need not be an integer."""
+
+    name: ClassVar[str] = "delay"
+
+    @property
+    def actuator(self) -> Actuator:
+        return Actuator(delay=max(self.sizes[0], 0.0))
+
+    def text(self, plant: Plant) -> str:
+        steps = f"{self.sizes[0]:.3g} steps" + ("" if self.held else ", not held over a step")
+        return f"commands arrive {_duration(plant.dt * self.sizes[0])} late ({steps})"
+
+
+@dataclass(frozen=True)
+class Lag(Late):
     """All inputs are followed by a first-order lag. Size: the time constant in steps."""
 
     name: ClassVar[str] = "lag"
-    remembers: ClassVar[bool] = True
 
-    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        lag = max(self.sizes[0], 1e-3)
-        left = (np.zeros_like(u) if memory is None else memory) - u
-        # What acts is the mean over the step of an input that approaches the command.
-        return u + left * lag * (1 - np.exp(-1 / lag)), u + left * np.exp(-1 / lag)
+    @property
+    def actuator(self) -> Actuator:
+        return Actuator(lag=max(self.sizes[0], 1e-3))
 
     def text(self, plant: Plant) -> str:
-        return f"the actuators follow with a time constant of {_duration(plant.dt * self.sizes[0])}"
+        held = "" if self.held else " while a step goes on"
+        return f"the actuators follow{held} with a time constant of {_duration(plant.dt * self.sizes[0])}"
+
+
+@dataclass(frozen=True)
+class ObservationDelay(Cause):
+    """The controller acts on old records. Their age is counted, and not fitted."""
+
+    sizes: tuple[float, ...] = ()
+    name: ClassVar[str] = "observation delay"
+    remembers: ClassVar[bool] = True
+    steps: int = 1  #: the age
+
+    def seeing(self, controller: Controller) -> Controller:
+        return SeeingLate(controller, self.steps)
+
+    def text(self, plant: Plant) -> str:
+        age = _duration(plant.dt * self.steps)
+        return f"the observations that the controller acts on are {counted(self.steps, 'step')} old ({age})"
+
+
+@dataclass(frozen=True)
+class SeeingLate:
+    """A controller that sees states some steps late, and the first one before it sees another one."""
+
+    controller: Controller
+    steps: int
+
+    def start(self, task: Task) -> Any:
+        """Return the memory before the first step."""
+        return memory_of(self.controller, task), ()
+
+    def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
+        """Return the inputs and the memory after the step."""
+        of_controller, before = memory
+        known = (*before, np.array(x))[-self.steps - 1 :]
+        u, of_controller = stepped(self.controller, t, known[0], of_controller)
+        return u, (of_controller, known)
 
 
 @dataclass(frozen=True)
@@ -223,6 +282,40 @@ class SensorScale(Cause):
 
 
 @dataclass(frozen=True)
+class WrappedAngle(Cause):
+    """The system keeps an angle within a turn, and M does not; or M does, and the system does not."""
+
+    sizes: tuple[float, ...] = ()
+    name: ClassVar[str] = "wrapped angle"
+    state: int = 0
+    turn: float = 2 * np.pi
+    low: float = -np.pi  #: the least value of the angle
+    of_model: bool = False  #: whether it is M that keeps the angle within the turn
+
+    def model(self, model: Model) -> Model:
+        if not self.of_model:
+            return model
+        return Function(lambda x, u: x + self.gap(np.asarray(model.step(x, u)) - x), vectorized=True)
+
+    def recorded(self, x: Array) -> Array:
+        if self.of_model:
+            return x
+        inside = np.array(x)
+        inside[..., self.state] = self.low + (x[..., self.state] - self.low) % self.turn
+        return inside
+
+    def gap(self, difference: Array) -> Array:
+        return difference - _at(difference, self.state, self.turn) * np.round(difference / self.turn)
+
+    def text(self, plant: Plant) -> str:
+        name, pi = plant.states[self.state][0], self.turn < 7
+        whole, half = ("2 pi", "pi") if pi else ("360", "180")
+        ends = f"0 to {whole}" if self.low == 0 else f"-{half} to {half}"
+        keeps = "M, unlike the system, keeps" if self.of_model else "the system, unlike M, keeps"
+        return f"{keeps} {name} within {ends}, with jumps of {whole}"
+
+
+@dataclass(frozen=True)
 class SwappedJoints(Cause):
     """The recorded states of two joints are exchanged."""
 
@@ -256,8 +349,9 @@ def of_inputs(plant: Plant) -> Iterator[CauseCandidate]:
         yield of_ratio(InputGain((1.0,), None))
     for first, second in combinations(range(m), 2):
         yield CauseCandidate(SwappedInputs((), first, second))
-    yield of_size(Delay((1.0,)), 0.0, 8.0, 0.2, 0.5, 1.5, 2.5, 4.0)
-    yield of_size(Lag((1.0,)), 0.05, 10.0, 0.2, 0.5, 1.5, 4.0)
+    for held in (True, False) if plant.compiled is None else (True,):  # parts of steps of MuJoCo cost more
+        yield of_size(Delay((1.0,), held), 0.0, 8.0, 0.2, 0.5, 1.5, 2.5, 4.0)
+        yield of_size(Lag((1.0,), held), 0.05, 10.0, 0.2, 0.5, 1.5, 4.0)
 
 
 def of_sensors(plant: Plant, x: Array) -> Iterator[CauseCandidate]:
@@ -272,3 +366,17 @@ def of_sensors(plant: Plant, x: Array) -> Iterator[CauseCandidate]:
     pairs = [group for group in moving if len(group) == len(moving[0])]
     for first, second in combinations(pairs, 2):
         yield CauseCandidate(SwappedJoints((), first, second))
+
+
+def wrapped_angles(x: Sequence[Array], following: Sequence[Array]) -> Iterator[CauseCandidate]:
+    """Yield the states that jump by a turn in runs ``(H + 1, n)`` or in M's next states ``(H, n)`` along them alone."""
+    gaps = [each - run[1:] for each, run in zip(following, x, strict=True)]
+    for state in range(x[0].shape[1]):
+        columns, apart = [run[:, state] for run in x], np.abs(np.concatenate(gaps)[:, state])
+        turn, _ = turns(columns)
+        of_model, columns = not turn, columns if turn else [each[:, state] for each in following]
+        turn = turn or turns(columns)[0]
+        far = apart[apart > 0.5 * turn]
+        if turn and len(far) and (np.abs(far - turn * np.round(far / turn)) < 0.25 * turn).all():
+            low = -0.5 * turn if min(column.min() for column in columns) < -0.02 * turn else 0.0
+            yield CauseCandidate(WrappedAngle((), state, turn, low, of_model))

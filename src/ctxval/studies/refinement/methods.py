@@ -132,7 +132,8 @@ class CauseRepair(ShortRepr, Method):
             if not some.executed:
                 raise InputError("the method 'causes' needs executions with trajectories.")
             with single_threaded():
-                return evidence.explained(evidence.Evidence(model, some.executed), best.candidates, best.sizes).repaired
+                executed = evidence.Evidence(model, some.executed, known=best.repaired.causes)
+                return evidence.explained(executed, best.candidates, best.sizes).repaired
 
         learned = repaired(records)
         note = " and ".join(cause.text(self.report.plant) for cause in learned.causes)

@@ -18,6 +18,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows, single_threaded
 from ctxval._util.representation import ShortRepr, counted
+from ctxval._util.turns import turns
 from ctxval.core.labels import labels_of
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
@@ -266,7 +267,7 @@ def faults(model: Model, recordings: Recordings, used: Sequence[int]) -> tuple[F
         columns = [run.states[:, number] for run in whole]
         others = [np.delete(run.states, number, axis=1) for run in whole]
         kinds: dict[FaultKind, list[Mask]] = {
-            "turn": _turns(columns), "frozen": _frozen(columns, others), "spike": _spikes(columns)
+            "turn": turns(columns)[1], "frozen": _frozen(columns, others), "spike": _spikes(columns)
         }  # fmt: skip
         for kind, marked in kinds.items():
             count = int(sum(mask.sum() for mask in marked))
@@ -289,18 +290,6 @@ def faults(model: Model, recordings: Recordings, used: Sequence[int]) -> tuple[F
     by_run = dict(zip(used, (float(error.sum()) / total for error in errors), strict=True))
     results += _files(recordings.runs, by_run)
     return tuple(sorted(results, key=lambda fault: -fault.share))
-
-
-def _turns(columns: Sequence[Array]) -> list[Mask]:
-    """Return the steps of each recording in which a state jumps by a turn and otherwise hardly changes."""
-    steps = [np.diff(column) for column in columns]
-    every, span = np.abs(np.concatenate(steps)), float(np.ptp(np.concatenate(columns)))
-    for turn in (2 * np.pi, 360.0):
-        jumps = [np.abs(np.abs(step) - turn) < 0.25 * turn for step in steps]
-        others = every[np.abs(every - turn) >= 0.25 * turn]
-        if any(jump.any() for jump in jumps) and span <= 1.05 * turn and others.max(initial=0.0) < 0.4 * turn:
-            return jumps
-    return [np.zeros(len(step), dtype=bool) for step in steps]
 
 
 def _frozen(columns: Sequence[Array], others: Sequence[Array]) -> list[Mask]:
