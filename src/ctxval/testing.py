@@ -106,16 +106,16 @@ def check_synthesizer(synthesizer: Synthesizer, task: Task, model: Model) -> Non
         controller = synthesizer.design(task[index], model)
         with _conforming():
             converged.append(converged_of(controller))
-            singles.append(rollout(model.step, controller, task[index]))
+            singles.append(rollout(model, controller, task[index]))
             _require(bool(singles[-1].finite), f"the closed loop on the model is not finite for task {index}")
-            again = rollout(model.step, controller, task[index])
+            again = rollout(model, controller, task[index])
             run = "the closed loop of a second run"
             _require_close(run, again.states, "that of the first", singles[-1].states, _TOLERANCE)
     if getattr(synthesizer, "batched", False):
         controller = synthesizer.design(task, model)
         with _conforming():
             together = converged_of(controller, task.batch_shape)
-            batch = rollout(model.step, controller, task)
+            batch = rollout(model, controller, task)
         alone = [each for each in converged if each is not None]
         same = not alone if together is None else np.array_equal(together, alone)
         _require(same, f"converged of a batch is {together}, and one by one it is {converged}")

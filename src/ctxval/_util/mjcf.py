@@ -5,16 +5,18 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ctxval._util.arrays import Array, rows_of
+from ctxval._util.checked import require_known
 from ctxval._util.files import read_bytes
 from ctxval._util.refusals import require_extra, reworded
-from ctxval.errors import InputError
+from ctxval.errors import InputError, ShapeError
 
 
 def is_mjcf_text(mjcf: str | Path) -> bool:
@@ -29,6 +31,116 @@ def compile_mjcf(mjcf: str | Path) -> tuple[str, Any]:
         digest = _digest(str(mjcf).encode(), Path()) if is_text else _digest(read_bytes(mjcf), Path(mjcf).parent)
     with reworded("MuJoCo cannot compile the model", ValueError):
         return digest, loader.from_xml_string(str(mjcf)) if is_text else loader.from_xml_path(str(mjcf))
+
+
+class Simulator:
+    """Simulations of a compiled model, whose states are ``(qpos, qvel)`` and chosen coordinates of sites.
+
+    The memory of a simulation is its whole state of integration: activations, the warm start of the constraint solver,
+    states of plugins, histories of inputs. A step follows from state, input and memory alone, in any batch.
+    """
+
+    def __init__(
+        self, model: Any, substeps: int = 1, sites: str | Sequence[str] = (), axes: str = "xy", threads: int = 1
+    ) -> None:
+        self.model, self.substeps, self.threads = model, substeps, threads
+        self.sites, self.axes = (sites,) if isinstance(sites, str) else tuple(sites), axes
+        if not axes or not set(axes) <= set("xyz"):
+            raise InputError(f"axes must be letters of 'xyz', got {axes!r}.")
+        known = [model.site(i).name for i in range(model.nsite)]
+        require_known("site", self.sites, known)
+        # The indices of the coordinates of sites in positions (nsite, 3).
+        rows = np.array([known.index(site) for site in self.sites], dtype=np.intp)
+        self._coordinates = np.ix_(rows, np.array(["xyz".index(axis) for axis in axes], dtype=np.intp))
+        self._idle: dict[int, list[Any]] = {}  # batches by their number of simulations; making one costs 10 steps
+
+    @property
+    def states(self) -> int:
+        """The number of states."""
+        return int(self.model.nq + self.model.nv + self._coordinates[0].size * self._coordinates[1].size)
+
+    @contextmanager
+    def _batch(self, count: int) -> Iterator[Any]:
+        size = 1 << (count - 1).bit_length() if count else 1
+        idle = self._idle.setdefault(size, [])
+        try:
+            batch = idle.pop()
+        except IndexError:
+            from mujoco.batch import Batch
+
+            batch = Batch(self.model, size, self.threads)
+            for name in ("qpos", "qvel", "ctrl", "site_xpos"):
+                batch.bind(name)
+        batch.warning[:] = 0
+        yield batch
+        idle.append(batch)
+
+    def start(self, x: Array, forces: Array | None = None) -> Array:
+        """Return the memory ``(..., k)`` of simulations that start from the model's defaults in states ``(..., n)``."""
+        rows, nq = rows_of(x), self.model.nq
+        with self._batch(1) as batch:
+            batch.reset(stage=0)
+            if forces is not None:
+                batch.bind("qfrc_applied")[:] = forces
+            memory = np.repeat(batch.state[:1], len(rows), axis=0)
+        with self._batch(len(rows)) as batch:
+            batch.state[: len(rows)] = memory
+            batch.qpos[: len(rows)], batch.qvel[: len(rows)] = rows[:, :nq], rows[:, nq : nq + self.model.nv]
+            return batch.state[: len(rows)].reshape(*x.shape[:-1], -1).copy()  # type: ignore[no-any-return]
+
+    def require(self, x: Array, u: Array) -> None:
+        """Refuse other numbers of states or inputs than those of the model."""
+        nq, nv, nu = self.model.nq, self.model.nv, self.model.nu
+        if x.shape[-1] != self.states or u.shape[-1] != nu:
+            got = f"{x.shape[-1]} states and {u.shape[-1]} inputs"
+            sites = f", {self.states - nq - nv} coordinates of sites" if self.sites else ""
+            raise ShapeError(f"the model has {nq} qpos, {nv} qvel{sites} and {nu} inputs, got {got}.")
+
+    def observed(self, x: Array) -> Array:
+        """Return whole states ``(..., n)`` of states that begin with qpos and qvel, with the sites where they are."""
+        rows, stage = rows_of(self.start(x)), _stage("POS")
+        with self._batch(len(rows)) as batch:
+            batch.state[: len(rows)] = rows
+            batch.forward(np.arange(len(rows)), stage=stage)
+            return self._observed(batch, len(rows)).reshape(*x.shape[:-1], -1)
+
+    def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array, Array]:
+        """Return next states ``(..., n)``, NaN after a warning or if x or u is not finite, memory and warnings.
+
+        The warnings ``(..., 7)`` of MuJoCo are booleans.
+        """
+        self.require(x, u)
+        nq, nv = self.model.nq, self.model.nv
+        states, inputs, memories = map(rows_of, (x, u, memory))
+        count = len(states)
+        healthy = np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1))
+        with self._batch(count) as batch, quiet():
+            batch.state[:count] = memories
+            batch.qpos[healthy], batch.qvel[healthy] = states[healthy, :nq], states[healthy, nq : nq + nv]
+            batch.ctrl[healthy] = inputs[healthy]
+            if len(healthy):
+                batch.step(healthy, self.substeps, _stage("POS" if self.sites else "NONE"))
+            warned = batch.warning[:count, :, 1] > 0
+            reached = self._observed(batch, count)
+            following = batch.state[:count].copy()
+        reached[np.setdiff1d(np.arange(count), healthy)] = np.nan
+        reached[warned.any(axis=1)] = np.nan
+        shape = x.shape[:-1]
+        return reached.reshape(x.shape), following.reshape(*shape, -1), warned.reshape(*shape, -1)
+
+    def _observed(self, batch: Any, count: int) -> Array:
+        sites, axes = self._coordinates
+        positions = batch.site_xpos[:count, sites, axes].reshape(count, -1)
+        return np.concatenate([batch.qpos[:count], batch.qvel[:count], positions], axis=1)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_idle": {}}
+
+
+def _stage(name: str) -> int:
+    from mujoco import mjtStage
+
+    return int(getattr(mjtStage, f"mjSTAGE_{name}"))
 
 
 @contextmanager

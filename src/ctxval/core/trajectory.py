@@ -28,6 +28,8 @@ from ctxval._util.texts import enumerated, guarded, parted, visible
 from ctxval.errors import InputError, ShapeError
 
 COMPLETE = "complete"
+TERMINATED, DIVERGED = "terminated", "diverged"
+"""First words of the reason why a closed loop itself ended early: by a fall or an instability, or without bounds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,7 @@ class Transitions(ShortRepr):
     u: Array
     x_next: Array
     dt: float | None = None
+    memory: Array | None = None  #: the memory of M in each step ``(N, k)``, NaN if it is not known; None if M has none
 
     def __post_init__(self) -> None:
         for name in ("x", "u", "x_next"):
@@ -50,7 +53,8 @@ class Transitions(ShortRepr):
             raise ShapeError(f"transitions need x (N, n), u (N, m) and x_next (N, n), got {got}.")
 
     def __getitem__(self, rows: slice | Rows | Mask) -> Transitions:
-        return Transitions(self.x[rows], self.u[rows], self.x_next[rows])
+        memory = None if self.memory is None else self.memory[rows]
+        return Transitions(self.x[rows], self.u[rows], self.x_next[rows], memory=memory)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -66,7 +70,9 @@ class Transitions(ShortRepr):
         if steps and not np.allclose(steps, steps[0], rtol=1e-3, atol=0):
             raise InputError(f"recorded steps must have one length, got {min(steps):g} s and {max(steps):g} s.")
         x, u, x_next = (np.concatenate([getattr(part, name) for part in parts]) for name in ("x", "u", "x_next"))
-        return Transitions(x, u, x_next, steps[0] if steps else None)
+        width = max((part.memory.shape[1] for part in parts if part.memory is not None), default=0)
+        memories = [np.full((len(part), width), np.nan) if part.memory is None else part.memory for part in parts]
+        return Transitions(x, u, x_next, steps[0] if steps else None, np.concatenate(memories) if width else None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -146,8 +146,8 @@ class Validation:
     def closed_loop(self, controller: Controller, task: Task) -> Trajectory:
         """Return the closed loop of a controller with M, as it is recorded."""
         if self.outputs is None:
-            return rollout(self.model.step, controller, task)
-        return self.outputs.of(rollout(self.model.step, self.outputs.seen_by(controller), task))
+            return rollout(self.model, controller, task)
+        return self.outputs.of(rollout(self.model, self.outputs.seen_by(controller), task))
 
     def with_parts(self, **changed: Any) -> Validation:
         """Return this validation with other arguments, such as another ``model``, ``distance`` or ``space``."""

@@ -14,7 +14,7 @@ from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
 from ctxval.core.controller import Controller, Feedback, started
 from ctxval.core.labels import require_names
-from ctxval.core.model import Model, Step, as_model
+from ctxval.core.model import Model, Step, as_model, run_of
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -132,7 +132,7 @@ class Imperfect:
             rng = np.random.default_rng([self.seed, of_task, self._executed])
         if self.start.any():
             start = start + self.start * rng.standard_normal(start.shape)
-        truth, late, acting = start, list[Array](), np.zeros(())
+        truth, late, acting, of_model = start, list[Array](), np.zeros(()), run_of(self.model, start)
 
         def record(x: Array) -> Array:
             read = x + self.measurement * rng.standard_normal(x.shape) if self.measurement.any() else x
@@ -148,7 +148,7 @@ class Imperfect:
             if self.lag:
                 u = acting + (u - acting) * (1 - np.exp(-1 / self.lag))
                 acting = u
-            truth = self.model.step(truth, u)
+            truth = of_model(truth, u)
             if self.process.any():
                 truth = truth + self.process * rng.standard_normal(truth.shape)
             return record(truth)
