@@ -163,6 +163,11 @@ def warning_of(counts: Any) -> str:
     return str(mjtWarning(int(np.argmax(np.asarray(counts) > 0))).name.removeprefix("mjWARN_"))
 
 
+def instability(warning: str) -> str:
+    """Return how the reason of an end begins: an unstable state is an outcome, and a full buffer of contacts is not."""
+    return "terminated: " if warning.startswith("BADQ") else ""
+
+
 def _digest(text: bytes, home: Path) -> str:
     """Return the digest of a model's text and of the files that it names: other models, meshes and height fields."""
     digest, waiting, folders, known = hashlib.sha256(), [text], {home}, set[Path]()

@@ -11,7 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array, rows_of
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval.errors import InputError, ModelError
+from ctxval.errors import InputError, ModelError, ShapeError
 
 if TYPE_CHECKING:
     from ctxval.core.trajectory import Trajectory, Transitions
@@ -48,7 +48,13 @@ class ModelWithMemory(Model, Protocol):
 
 def memory_in(model: Model, x: Array) -> Array:
     """Return the memory of a model at the start of closed loops in states ``(..., n)``; ``(..., 0)`` if it has none."""
-    return model.start(x) if isinstance(model, ModelWithMemory) else np.empty((*x.shape[:-1], 0))
+    if not isinstance(model, ModelWithMemory):
+        return np.empty((*x.shape[:-1], 0))
+    memory = np.array(model.start(x), dtype=np.float64)
+    if memory.shape[:-1] != x.shape[:-1] or not memory.ndim:
+        wanted = ", ".join([*map(str, x.shape[:-1]), "k"]) + "," * (x.ndim == 1)
+        raise ShapeError(f"start of the model must return a memory of shape ({wanted}), got {memory.shape}.")
+    return memory
 
 
 def advanced(model: Model, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
@@ -88,7 +94,7 @@ def with_memory(model: Model, recorded: Trajectory) -> Transitions:
         return transitions
     memories = []
     for t in range(recorded.horizon):
-        memories.append(memory)
+        memories.append(np.array(memory))
         memory = advanced(model, recorded.states[..., t, :], recorded.inputs[..., t, :], memory)[1]
     return replace(transitions, memory=rows_of(np.stack(memories, axis=-2)))
 

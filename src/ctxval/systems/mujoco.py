@@ -11,12 +11,12 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, require_shape, rows_of
 from ctxval._util.checked import PositiveInt
-from ctxval._util.mjcf import Simulator, compile_mjcf, warning_of
+from ctxval._util.mjcf import Simulator, compile_mjcf, instability, warning_of
 from ctxval._util.registry import part
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
-from ctxval.core.trajectory import TERMINATED, Trajectory
+from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError, ShapeError
 
 
@@ -90,9 +90,7 @@ class MuJoCo:
             x, memory, warned = self._simulator.advance(x, u, memory)
             if warned.any() and not failure:
                 name = warning_of(warned.reshape(-1, warned.shape[-1]).any(axis=0))
-                # An unstable state is an outcome; a full buffer, as of contacts, is a failure of the simulation.
-                kind = f"{TERMINATED}: " if name.startswith("BADQ") else ""
-                failure = f"{kind}MuJoCo warned of {name} at step {steps}"
+                failure = f"{instability(name)}MuJoCo warned of {name} at step {steps}"
             return x
 
         trajectory = rollout(step, controller, task)
