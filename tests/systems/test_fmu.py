@@ -420,7 +420,7 @@ ROOM_3 = (
 )  # fmt: skip
 
 
-@pytest.fixture(params=["pythonfmu", "pythonfmu3"], scope="module")
+@pytest.fixture(params=["pythonfmu", *more("pythonfmu3")], scope="module")
 def room(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip(request.param)
     source = ROOM_2 if request.param == "pythonfmu" else ROOM_3

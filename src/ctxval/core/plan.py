@@ -16,7 +16,7 @@ from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller, started
 from ctxval.core.space import Parameters
 from ctxval.core.task import Task
-from ctxval.core.trajectory import Trajectory, require_times
+from ctxval.core.trajectory import COMPLETE, Trajectory, require_times
 from ctxval.errors import CtxvalError, DesignError, DistanceError, InputError, ShapeError
 
 if TYPE_CHECKING:
@@ -74,6 +74,25 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
         raise InputError(f"the trajectory starts elsewhere: state {i} must start at {wanted}. {advice}")
 
 
+def recorded_until_end(plan: Plan, trajectory: Trajectory, start_tolerance: float) -> Trajectory:
+    """Return the steps of a closed loop that ended early, by a fall or an instability; refuse another task's."""
+    expected = plan.model_trajectory
+    if (trajectory.states.ndim, trajectory.states.shape[-1], trajectory.inputs.shape[-1]) != (
+        (2, expected.states.shape[-1], expected.inputs.shape[-1])
+    ):
+        wanted = f"{expected.states.shape[-1]} states and {expected.inputs.shape[-1]} inputs"
+        raise ShapeError(
+            f"the trajectory must have {wanted}, got {trajectory.states.shape} and {trajectory.inputs.shape}."
+        )
+    recorded = trajectory.first(int(trajectory.lengths))
+    common, compared = min(recorded.horizon, expected.horizon), recorded
+    if not common:  # it ended in its first step, so only its start can be compared
+        states = np.stack([trajectory.states[0], expected.states[1]])
+        common, compared = 1, Trajectory(trajectory.times[:2], states, expected.inputs[:1])
+    require_execution(replace(plan, model_trajectory=expected.first(common)), compared.first(common), start_tolerance)
+    return recorded
+
+
 def recorded_before_failure(plan: Plan, trajectory: object, start_tolerance: float) -> Trajectory:
     """Return the steps of a plan that were recorded before its execution failed; refuse what has none of them."""
     expected = plan.model_trajectory
@@ -98,6 +117,10 @@ def least_distance(validation: Validation, point: ArrayLike, model: Trajectory, 
     It is the distance if S had followed M from there on. Numbers that diverge are cut off where it is not finite.
     """
     if not getattr(validation.distance, "monotone", False):
+        return None
+    if model.ended != COMPLETE:
+        with suppress(DistanceError):
+            return validation.remeasure(point, model, recorded)
         return None
     for steps in range(recorded.horizon, 0, -1):
         states = np.concatenate([recorded.states[: steps + 1], model.states[steps + 1 :]])
@@ -193,6 +216,7 @@ def require_repeatable(validation: Validation, plan: Plan) -> None:
         )
     try:
         again = validation.closed_loop(plan.controller, plan.task)
+        again = again.first(min(int(again.lengths), first.horizon))
     except CtxvalError:
         raise
     except Exception as error:

@@ -10,10 +10,8 @@ from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller, started
 from ctxval.core.model import Model, Step, run_of
 from ctxval.core.task import Task
-from ctxval.core.trajectory import Trajectory
+from ctxval.core.trajectory import ENORMOUS, Trajectory
 from ctxval.errors import CtxvalError, ShapeError
-
-_ENORMOUS = 1e100  # states from which sums of inputs may overflow
 
 
 def rollout(model: Model | Step, controller: Controller, task: Task, *, partial: bool = False) -> Trajectory:
@@ -61,7 +59,7 @@ def rollout(model: Model | Step, controller: Controller, task: Task, *, partial:
     bad = ~np.isfinite(flat).all(axis=1)
     first = int(bad.argmax()) if bad.any() else task.horizon
     # NaN for a state that is a number is the controller's doing, unless the loop grew beyond all numbers.
-    ordinary = np.abs(flat[:first]).max(axis=1) < _ENORMOUS
+    ordinary = np.abs(flat[:first]).max(axis=1) < ENORMOUS
     without = ordinary & np.isnan(inputs.reshape(task.horizon, -1)[:first]).any(axis=1)
     if without.any():
         return replace(trajectory, ended=f"got NaN from its controller at step {without.argmax()}")

@@ -129,7 +129,7 @@ class FMU:
         their first step only. So a very short step of another instance shows where such a state starts.
         """
         values: list[float | None] = task.initial_state.tolist()
-        shown: list[float] | None = None
+        shown = list[float]()
         if self._calculated and len(values) == len(self.states):
             try:
                 process.ask("begin", values, 1e-9 * step, 1)
@@ -138,15 +138,15 @@ class FMU:
                 own = [i for i in self._calculated if self.start[self.states[i]] == self.states[i]]
                 values = [None if i in own else value for i, value in enumerate(values)]
                 process.ask("begin", values, 1e-9 * step, 1)
-            shown = process.ask("advance", [])[0]
+            shown = process.ask("advance", [])[0] or []
             process.ask("free")
         state = process.ask("begin", values, step, substeps)
-        for i in self._calculated if shown is not None else ():
+        for i in self._calculated if shown else ():
             state[i] = shown[i]
         try:
             require_started(task, np.array(state))
         except InputError as error:
-            if not self._calculated:
+            if not shown:
                 raise
             names = ", ".join(self.states[i] for i in self._calculated)
             advice = (
@@ -264,11 +264,12 @@ def _unpacked(path: Path) -> tuple[Any, str]:
 
 def _has_start(variable: Any) -> bool:
     """Return whether the description of an FMU gives a variable a start value that may be set."""
-    return variable.variability != "constant" and variable.initial in ("exact", "approx")
+    return bool(variable.variability != "constant" and variable.initial in ("exact", "approx"))
 
 
 def _is_input(variable: Any) -> bool:
-    return variable.causality == "input" or (variable.causality == "parameter" and variable.variability == "tunable")
+    kinds = variable.causality, variable.variability
+    return kinds[0] == "input" or kinds == ("parameter", "tunable")
 
 
 def _told(variable: Any) -> str:
