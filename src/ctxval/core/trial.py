@@ -30,7 +30,7 @@ UNSTEADY = "unsteady"
 
 AT_LEAST = "at_least"  #: key in the note of a failed trial: the distance that the steps before the failure have already
 
-ENDED = "ended"
+ENDED = "ends"
 """Key in the note of a trial whose closed loops ended early, by a fall or an instability: when those of M and S did.
 
 The times are in seconds, null for a loop that did not end. If S alone did, M was wrong by more than any distance.
