@@ -645,6 +645,20 @@ name = "gp-ucb"
 """
 
 
+@pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
+def test_one_fmu_as_model_and_as_system_has_the_distance_0(path: Path) -> None:
+    one, system = FMU(path, **NAMES), FMU(path, **NAMES)
+    validation = Validation(
+        space=TaskSpace(start=(0.5, 1.0)),
+        task=lambda p: Task([p.start, -0.5], horizon=10, dt=0.1),
+        system=system,
+        model=lambda x, u: one.execute(lambda t, _: u, Task(x, horizon=1, dt=0.1)).final_state,
+        synthesizer=controllers.Policy(lambda t, x, task: feedback(t, x), vectorized=False),
+        distance=distances.MaximumDeviation(),
+    )
+    assert validation.distances([[0.5], [1.0]]).tolist() == [0.0, 0.0]
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_costs")
 @pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)

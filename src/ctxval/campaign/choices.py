@@ -11,7 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call, fields_of, lines, shown
 from ctxval._util.texts import text_of
-from ctxval.core.plan import Plan, least_distance, recorded_before_failure, recorded_until_end
+from ctxval.core.plan import Plan, ended_early, least_distance, recorded_before_failure, recorded_until_end
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.core.trial import AT_LEAST, ENDED, Origin, State, Trial
 from ctxval.core.validation import Validation
@@ -103,7 +103,7 @@ class Execution:
         if self.failed is not None or self.distance is not None:
             return self
         run, of_model = self.trajectory, plan.model_trajectory
-        if isinstance(run, Trajectory) and run.is_outcome:
+        if isinstance(run, Trajectory) and ended_early(plan, run):
             tolerance = validation.start_tolerance if start_tolerance is None else start_tolerance
             run = recorded_until_end(plan, run, tolerance)
             alone = of_model.ended == COMPLETE

@@ -14,7 +14,7 @@ from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.controllers.lqr import QuadraticCost
 from ctxval.core.controller import Limits, LimitsLike
-from ctxval.core.model import Model, linearize, run_of
+from ctxval.core.model import Model, linearize
 from ctxval.core.task import Task
 from ctxval.errors import DesignError, ShapeError
 
@@ -92,9 +92,9 @@ class RecedingHorizon(ShortRepr):
 
         def predicted(U: Array) -> Array:
             X = np.empty((len(U) + 1, len(start)))
-            X[0], step = start, run_of(self.model, start)
+            X[0] = start
             for k, u in enumerate(U):
-                X[k + 1] = step(X[k], u)
+                X[k + 1] = self.model.step(X[k], u)
             return X
 
         def merit(X: Array, U: Array) -> float:

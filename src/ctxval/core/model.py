@@ -87,14 +87,17 @@ def predicted_steps(model: Model, recorded: Transitions) -> Array:
     return predicted
 
 
-def with_memory(model: Model, recorded: Trajectory) -> Transitions:
-    """Return the transitions of a trajectory with the memory that a model has if it follows the recorded states."""
+def with_memory(model: Model, recorded: Trajectory, *, started: bool = True) -> Transitions:
+    """Return the transitions of a trajectory with the memory that a model has if it follows the recorded states.
+
+    The memory of the first step is not known if the system was not ``started`` there.
+    """
     transitions, memory = recorded.transitions(), memory_in(model, recorded.states[..., 0, :])
     if not memory.shape[-1]:
         return transitions
     memories = []
     for t in range(recorded.horizon):
-        memories.append(np.array(memory))
+        memories.append(np.array(memory) if t or started else np.full_like(memory, np.nan))
         memory = advanced(model, recorded.states[..., t, :], recorded.inputs[..., t, :], memory)[1]
     return replace(transitions, memory=rows_of(np.stack(memories, axis=-2)))
 

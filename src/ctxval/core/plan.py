@@ -17,7 +17,7 @@ from ctxval.core.controller import Controller, started
 from ctxval.core.space import Parameters
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory, require_times
-from ctxval.errors import CtxvalError, DesignError, DistanceError, InputError, ShapeError
+from ctxval.errors import CtxvalError, DesignError, DistanceError, ExecutionError, InputError, ShapeError
 
 if TYPE_CHECKING:
     from ctxval.core.validation import Validation
@@ -72,6 +72,29 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
                 "All its states are equal: if the system's code changes one array in each step, record copies of it."
             )
         raise InputError(f"the trajectory starts elsewhere: state {i} must start at {wanted}. {advice}")
+
+
+def require_complete(plan: Plan, trajectory: Trajectory) -> None:
+    """Refuse a trajectory that ended early or is not finite, and one of a task in which M alone ended early."""
+    expected = plan.model_trajectory
+    if trajectory.ended != COMPLETE:
+        raise ExecutionError(trajectory.ended)
+    if expected.ended != COMPLETE:
+        end = f"the model's closed loop ended after {expected.times[-1] - expected.times[0]:.3g} s"
+        raise ExecutionError(f"{end}, and the execution did not: repair the model (`ctxval check` with --aspect1)")
+    if not trajectory.finite.all():
+        unknown, what = np.argwhere(~np.isfinite(trajectory.states)), "an input"
+        if len(unknown):
+            place = tuple(unknown[0])  # of a batch, too, which is refused later if it is finite
+            what = f"state {place[-1]} is {trajectory.states[place]:g} at step {place[-2]}"
+        raise ExecutionError(f"the system's trajectory is not finite: {what}")
+
+
+def ended_early(plan: Plan, trajectory: Trajectory) -> bool:
+    """Return whether the closed loop of a trajectory itself ended early, by its reason or without a state as M."""
+    if trajectory.ended != COMPLETE or plan.model_trajectory.ended == COMPLETE or trajectory.batch_shape:
+        return trajectory.is_outcome
+    return bool(trajectory.predicts and not trajectory.finite)
 
 
 def recorded_until_end(plan: Plan, trajectory: Trajectory, start_tolerance: float) -> Trajectory:

@@ -24,7 +24,7 @@ from ctxval.core.controller import Controller, Synthesizer, is_controller
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels, names_of, require_names
 from ctxval.core.model import Model, Step, as_model, require_time_step
-from ctxval.core.plan import Outcome, Plan, recorded_until_end, require_execution
+from ctxval.core.plan import Outcome, Plan, ended_early, recorded_until_end, require_complete, require_execution
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.system import OutputsLike, Simulated, System, WithOutputs, as_outputs
@@ -199,20 +199,9 @@ class Validation:
         tolerance = self.start_tolerance if start_tolerance is None else start_tolerance
         if not isinstance(trajectory, Trajectory):
             raise ExecutionError(f"the system returned {type(trajectory).__name__} instead of a Trajectory")
-        expected = plan.model_trajectory
-        if trajectory.is_outcome and expected.ended != COMPLETE:
+        if ended_early(plan, trajectory) and plan.model_trajectory.ended != COMPLETE:
             return recorded_until_end(plan, trajectory, tolerance)
-        if trajectory.ended != COMPLETE:
-            raise ExecutionError(trajectory.ended)
-        if expected.ended != COMPLETE:
-            end = f"the model's closed loop ended after {expected.times[-1] - expected.times[0]:.3g} s"
-            raise ExecutionError(f"{end}, and the execution did not: repair the model (`ctxval check` with --aspect1)")
-        if not trajectory.finite.all():
-            unknown, what = np.argwhere(~np.isfinite(trajectory.states)), "an input"
-            if len(unknown):
-                place = tuple(unknown[0])  # of a batch, too, which is refused below if it is finite
-                what = f"state {place[-1]} is {trajectory.states[place]:g} at step {place[-2]}"
-            raise ExecutionError(f"the system's trajectory is not finite: {what}")
+        require_complete(plan, trajectory)
         require_execution(plan, trajectory, tolerance)
         return trajectory
 

@@ -40,7 +40,7 @@ def recorded_transitions(
     parts = [with_memory(model, trajectory) for trajectory in executed]
     sources = [np.full(len(part), k) for k, part in enumerate(parts)]
     if logged:
-        others = [with_memory(model, trajectory) for trajectory in logged]
+        others = [with_memory(model, trajectory, started=False) for trajectory in logged]
         of = np.repeat(len(executed) + np.arange(len(others)), [len(part) for part in others])
         together = Transitions.joined(others)
         rows = _nearest(together, loops, 1500, many=True)
