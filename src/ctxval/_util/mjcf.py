@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, rows_of
+from ctxval._util.arrays import Array, Mask, rows_of
 from ctxval._util.checked import require_known
 from ctxval._util.files import read_bytes
 from ctxval._util.refusals import require_extra, reworded
@@ -52,7 +52,7 @@ class Simulator:
         # The indices of the coordinates of sites in positions (nsite, 3).
         rows = np.array([known.index(site) for site in self.sites], dtype=np.intp)
         self._coordinates = np.ix_(rows, np.array(["xyz".index(axis) for axis in axes], dtype=np.intp))
-        self._idle: dict[int, list[Any]] = {}  # batches by their number of simulations; making one costs 10 steps
+        self._idle: dict[int, list[_Batch]] = {}  # batches by their number of simulations; making one costs 10 steps
 
     @property
     def states(self) -> int:
@@ -60,17 +60,13 @@ class Simulator:
         return int(self.model.nq + self.model.nv + self._coordinates[0].size * self._coordinates[1].size)
 
     @contextmanager
-    def _batch(self, count: int) -> Iterator[Any]:
+    def _batch(self, count: int) -> Iterator[_Batch]:
         size = 1 << (count - 1).bit_length() if count else 1
         idle = self._idle.setdefault(size, [])
         try:
             batch = idle.pop()
         except IndexError:
-            from mujoco.batch import Batch
-
-            batch = Batch(self.model, size, self.threads)
-            for name in ("qpos", "qvel", "ctrl", "site_xpos"):
-                batch.bind(name)
+            batch = _Batch(self.model, size, self.threads)
         batch.warning[:] = 0
         yield batch
         idle.append(batch)
@@ -79,14 +75,14 @@ class Simulator:
         """Return the memory ``(..., k)`` of simulations that start from the model's defaults in states ``(..., n)``."""
         rows, nq = rows_of(x), self.model.nq
         with self._batch(1) as batch:
-            batch.reset(stage=0)
+            batch.batch.reset(stage=batch.nothing)
             if forces is not None:
-                batch.bind("qfrc_applied")[:] = forces
+                batch.batch.bind("qfrc_applied")[:] = forces
             memory = np.repeat(batch.state[:1], len(rows), axis=0)
         with self._batch(len(rows)) as batch:
             batch.state[: len(rows)] = memory
             batch.qpos[: len(rows)], batch.qvel[: len(rows)] = rows[:, :nq], rows[:, nq : nq + self.model.nv]
-            return batch.state[: len(rows)].reshape(*x.shape[:-1], -1).copy()  # type: ignore[no-any-return]
+            return batch.state[: len(rows)].reshape(*x.shape[:-1], -1).copy()
 
     def require(self, x: Array, u: Array) -> None:
         """Refuse other numbers of states or inputs than those of the model."""
@@ -98,13 +94,13 @@ class Simulator:
 
     def observed(self, x: Array) -> Array:
         """Return whole states ``(..., n)`` of states that begin with qpos and qvel, with the sites where they are."""
-        rows, stage = rows_of(self.start(x)), _stage("POS")
+        rows = rows_of(self.start(x))
         with self._batch(len(rows)) as batch:
             batch.state[: len(rows)] = rows
-            batch.forward(np.arange(len(rows)), stage=stage)
+            batch.batch.forward(np.arange(len(rows)), stage=batch.positions)
             return self._observed(batch, len(rows)).reshape(*x.shape[:-1], -1)
 
-    def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array, Array]:
+    def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array, Mask]:
         """Return next states ``(..., n)``, NaN after a warning or if x or u is not finite, memory and warnings.
 
         The warnings ``(..., 7)`` of MuJoCo are booleans.
@@ -113,34 +109,46 @@ class Simulator:
         nq, nv = self.model.nq, self.model.nv
         states, inputs, memories = map(rows_of, (x, u, memory))
         count = len(states)
-        healthy = np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1))
-        with self._batch(count) as batch, quiet():
+        healthy = np.asarray(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1))
+        ids = np.flatnonzero(healthy)
+        rows = slice(count) if len(ids) == count else ids  # views are faster than copies
+        with self._batch(count) as batch:
             batch.state[:count] = memories
-            batch.qpos[healthy], batch.qvel[healthy] = states[healthy, :nq], states[healthy, nq : nq + nv]
-            batch.ctrl[healthy] = inputs[healthy]
-            if len(healthy):
-                batch.step(healthy, self.substeps, _stage("POS" if self.sites else "NONE"))
-            warned = batch.warning[:count, :, 1] > 0
+            batch.qpos[rows], batch.qvel[rows] = states[rows, :nq], states[rows, nq : nq + nv]
+            batch.ctrl[rows] = inputs[rows]
+            if len(ids):
+                batch.batch.step(ids, self.substeps, batch.positions if self.sites else batch.nothing)
+            warned: Mask = np.asarray(batch.warning[:count, :, 1] > 0)
             reached = self._observed(batch, count)
             following = batch.state[:count].copy()
-        reached[np.setdiff1d(np.arange(count), healthy)] = np.nan
-        reached[warned.any(axis=1)] = np.nan
+        reached[~healthy | warned.any(axis=1)] = np.nan
         shape = x.shape[:-1]
         return reached.reshape(x.shape), following.reshape(*shape, -1), warned.reshape(*shape, -1)
 
-    def _observed(self, batch: Any, count: int) -> Array:
-        sites, axes = self._coordinates
-        positions = batch.site_xpos[:count, sites, axes].reshape(count, -1)
-        return np.concatenate([batch.qpos[:count], batch.qvel[:count], positions], axis=1)
+    def _observed(self, batch: _Batch, count: int) -> Array:
+        parts = [batch.qpos[:count], batch.qvel[:count]]
+        if self.sites:
+            sites, axes = self._coordinates
+            parts.append(batch.site_positions[:count, sites, axes].reshape(count, -1))
+        return np.concatenate(parts, axis=1)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_idle": {}}
 
 
-def _stage(name: str) -> int:
-    from mujoco import mjtStage
+class _Batch:
+    """Simulations with the arrays that they share: state ``(N, k)``, of which qpos, qvel and ctrl are views."""
 
-    return int(getattr(mjtStage, f"mjSTAGE_{name}"))
+    def __init__(self, model: Any, count: int, threads: int) -> None:
+        from mujoco import mjtStage
+        from mujoco.batch import Batch
+
+        self.batch = Batch(model, count, threads)
+        self.qpos, self.qvel, self.ctrl = (self.batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
+        self.site_positions: Array = self.batch.bind("site_xpos")  # (N, nsite, 3)
+        self.state: Array = self.batch.state
+        self.warning: Array = self.batch.warning
+        self.nothing, self.positions = int(mjtStage.mjSTAGE_NONE), int(mjtStage.mjSTAGE_POS)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from typing import Any
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import Seconds
-from ctxval._util.mjcf import Simulator, compile_mjcf, is_mjcf_text
+from ctxval._util.mjcf import Simulator, compile_mjcf, is_mjcf_text, quiet
 from ctxval._util.refusals import require_extra
 from ctxval._util.registry import part
 from ctxval.core.model import paired
@@ -96,7 +96,8 @@ class MuJoCo:
     def step(self, x: Array, u: Array) -> Array:
         self._simulator.require(x, u)
         x, u = paired(x, u)
-        return self._converging.advance(x, u, self.start(x))[0]
+        with quiet():
+            return self._converging.advance(x, u, self.start(x))[0]
 
     def start(self, x: Array) -> Array:
         """Return the memory ``(..., k)`` of simulations that start in states ``(..., n)`` from the model's defaults."""
@@ -105,7 +106,8 @@ class MuJoCo:
     def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
         """Return the next states ``(..., n)`` of simulations and their memory ``(..., k)``."""
         x, u = paired(x, u)
-        return self._simulator.advance(x, u, memory)[:2]
+        with quiet():
+            return self._simulator.advance(x, u, memory)[:2]
 
 
 def identified_in(path: Path) -> Path:

@@ -171,13 +171,9 @@ class Gymnasium:
             return np.full_like(state, np.nan), f"{instability(name)}MuJoCo warned of {name}"
         if self.ignore_termination or not (terminated or truncated):
             return state, ""
-        # A time limit says nothing about the system.
-        return (
-            state,
-            f"{TERMINATED}: the environment ended the episode"
-            if terminated
-            else "the environment truncated the episode",
-        )
+        if terminated:
+            return state, f"{TERMINATED}: the environment ended the episode"
+        return state, "the environment truncated the episode"  # a time limit says nothing about the system
 
     def __getstate__(self) -> dict[str, Any]:
         # Environments cannot be pickled; another process makes its own.
