@@ -20,7 +20,7 @@ from ctxval.core.model import predicted_steps, with_memory
 from ctxval.core.trajectory import Transitions
 from ctxval.data import recordings_of
 from ctxval.data.log import MemoryTable
-from ctxval.errors import InputError, ModelError, ShapeError
+from ctxval.errors import ExecutionError, InputError, ModelError, ShapeError
 from ctxval.studies.fitting import fit
 
 mujoco = pytest.importorskip("mujoco")
@@ -164,7 +164,7 @@ def walking(**parts: Any) -> Validation:
         "space": TaskSpace(height=(0.3, 0.5, "m")),
         "task": lambda p: Task(
             system.state([0, 0, 0, 1, 0, 0, 0, 0.1, -0.1] + np.asarray(p.height)[..., None] * height),
-            horizon=60,
+            horizon=40,
             dt=system.dt,
         ),
         "system": system,
@@ -202,6 +202,26 @@ def test_recorded_steps_of_the_same_engine_leave_no_residual() -> None:
     both = predicted_steps(validation.model, Transitions.joined([recorded, data]))
     assert (both[: len(recorded)] == recorded.x_next).all()
     np.testing.assert_array_equal(both[len(recorded) :], validation.model.step(data.x, data.u))
+
+
+def test_an_instability_of_both_is_agreement_and_of_one_a_counterexample(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warnings into the working directory
+    unstable = mjcf(0.0).replace("damping", 'stiffness="-1e9" damping')
+    parts: dict[str, Any] = {
+        "space": TaskSpace(start=(0.1, 0.2)),
+        "task": lambda p: Task([p.start, 0.0], horizon=30, dt=0.005),
+        "synthesizer": controllers.Policy(lambda t, x, task: 0 * x[..., :1]),
+        "distance": distances.MaximumDeviation(),
+        "system": systems.MuJoCo(unstable),
+    }
+    both = Validation(model=models.MuJoCo(unstable), **parts)
+    assert both.outcome([0.15]).distance == 0.0
+    assert both.plan([0.15]).model_trajectory.horizon < 30
+    assert both.distances([[0.1], [0.2]]).tolist() == [0.0, 0.0]
+    with pytest.raises(ExecutionError, match=r"^terminated: MuJoCo warned of BADQACC at step \d+$"):
+        Validation(model=models.MuJoCo(mjcf(0.0)), **parts).outcome([0.15])
 
 
 def test_a_step_without_memory_lets_the_solver_converge() -> None:
