@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -18,7 +19,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.certificates import Certificate, CertificateKind, Sample
 from ctxval.core.controller import Controller, Synthesizer, converged_of, each_alone
 from ctxval.core.distance import Distance
-from ctxval.core.model import Model, central_differences, linearize
+from ctxval.core.model import Model, ModelWithMemory, advanced, central_differences, linearize, memory_in
 from ctxval.core.rollout import rollout
 from ctxval.core.system import OutputsLike, System, as_outputs
 from ctxval.core.task import Task
@@ -33,7 +34,7 @@ _TOLERANCE = 1e-10
 def check_model(
     model: Model, *, states: int, inputs: int, seed: int = 0, scale: float = 1.0, tolerance: float = _TOLERANCE
 ) -> None:
-    """Check that a model gives the same steps for a batch as one by one, and that its Jacobian is its derivative.
+    """Check that a model gives the same steps again, and for a batch as one by one, and that its Jacobian is right.
 
     Args:
         states, inputs: the numbers of states n and of inputs m.
@@ -47,6 +48,12 @@ def check_model(
     _require(bool(np.isfinite(batch).all()), "step returns values that are not finite")
     single = np.array([model.step(xi, ui) for xi, ui in zip(x, u, strict=True)])
     _require_close("step of a batch", batch, "the steps one by one", single, tolerance)
+    _require_close("a second step of a batch", np.asarray(model.step(x, u)), "the first", batch, tolerance)
+    if isinstance(model, ModelWithMemory):
+        memories = [memory_in(model, x), *(memory_in(model, row) for row in x)]
+        together, each = advanced(model, x, u, memories[0]), [*map(partial(advanced, model), x, u, memories[1:])]
+        for name, part, alone in zip(("advance", "memory"), together, zip(*each, strict=True), strict=True):
+            _require_close(f"{name} of a batch", np.asarray(part), "those one by one", np.stack(alone), tolerance)
     if hasattr(model, "jacobian"):
         A, B = linearize(model, x, u)
         A_numeric, B_numeric = central_differences(model.step, x, u)
@@ -106,16 +113,16 @@ def check_synthesizer(synthesizer: Synthesizer, task: Task, model: Model) -> Non
         controller = synthesizer.design(task[index], model)
         with _conforming():
             converged.append(converged_of(controller))
-            singles.append(rollout(model.step, controller, task[index]))
+            singles.append(rollout(model, controller, task[index]))
             _require(bool(singles[-1].finite), f"the closed loop on the model is not finite for task {index}")
-            again = rollout(model.step, controller, task[index])
+            again = rollout(model, controller, task[index])
             run = "the closed loop of a second run"
             _require_close(run, again.states, "that of the first", singles[-1].states, _TOLERANCE)
     if getattr(synthesizer, "batched", False):
         controller = synthesizer.design(task, model)
         with _conforming():
             together = converged_of(controller, task.batch_shape)
-            batch = rollout(model.step, controller, task)
+            batch = rollout(model, controller, task)
         alone = [each for each in converged if each is not None]
         same = not alone if together is None else np.array_equal(together, alone)
         _require(same, f"converged of a batch is {together}, and one by one it is {converged}")

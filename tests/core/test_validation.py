@@ -326,10 +326,9 @@ def test_a_model_that_raises_is_named_with_its_reason() -> None:
         validation.plan(POINT)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_model_that_is_not_finite_is_refused_with_the_task(bad: float) -> None:
+def test_a_model_that_diverges_is_refused_with_the_task() -> None:
     broken = Linear(MODEL.A, MODEL.B)
-    broken.step = lambda x, u: np.where(np.abs(x) > 0.9, bad, MODEL.step(x, u))
+    broken.step = lambda x, u: np.where(np.abs(x) > 0.9, np.inf, MODEL.step(x, u))
     validation = make(model=broken, synthesizer=Policy(lambda t, x, task: 0 * x[..., :1]))
     with pytest.raises(
         ModelError, match=r"closed loop diverged at step \d+ for the task \{'goal': 1\.0, 'start': 0\.5\}"

@@ -21,6 +21,8 @@ A, B = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]]
 LQR = controllers.LQR([1.0, 0.1], [0.1])
 MOST, MOST_OF_MODEL = 3000, 600
 
+MODEL = models.Linear(np.eye(2), np.ones((2, 1)))
+
 
 def make_validation(synthesizer: Any = LQR, model: Any = None) -> Validation:
     return Validation(
@@ -79,13 +81,13 @@ class Batched(Refusing):
 
 
 def test_nothing_is_known_without_executions_and_data() -> None:
-    assert recorded_transitions(None, [], loops()) is None
+    assert recorded_transitions(MODEL, None, [], loops()) is None
 
 
 @given(st.integers(1, 4))
 def test_each_transition_has_the_number_of_its_execution(count: int) -> None:
     executed = executions(count)
-    found = recorded_transitions(None, executed, loops())
+    found = recorded_transitions(MODEL, None, executed, loops())
     assert found is not None
     transitions, sources = found
     np.testing.assert_array_equal(sources, np.repeat(np.arange(count), 12))
@@ -98,7 +100,7 @@ def test_each_transition_has_the_number_of_its_execution(count: int) -> None:
 
 def test_the_data_of_the_model_have_no_execution() -> None:
     own = data(50)
-    found = recorded_transitions(data_near(models.Linear(A, B, data=own), loops()), executions(1), loops())
+    found = recorded_transitions(MODEL, data_near(models.Linear(A, B, data=own), loops()), executions(1), loops())
     assert found is not None
     transitions, sources = found
     np.testing.assert_array_equal(sources, [*[0] * 12, *[-1] * 50])
@@ -108,7 +110,7 @@ def test_the_data_of_the_model_have_no_execution() -> None:
 def test_of_many_data_those_near_the_closed_loops_are_kept() -> None:
     near, far = data(MOST_OF_MODEL, 0.1), data(400, 0.1)
     everything = Transitions.joined([Transitions(far.x + 50, far.u + 50, far.x_next + 50), near])
-    found = recorded_transitions(data_near(models.Linear(A, B, data=everything), loops()), [], loops())
+    found = recorded_transitions(MODEL, data_near(models.Linear(A, B, data=everything), loops()), [], loops())
     assert found is not None
     np.testing.assert_array_equal(rows_of(found[0]), rows_of(near))
 
@@ -117,14 +119,14 @@ def test_if_all_closed_loops_diverge_all_data_are_kept() -> None:
     own = data(MOST_OF_MODEL + 100)
     diverged = loops()
     infinite = Trajectory(diverged.times, np.full_like(diverged.states, np.inf), diverged.inputs)
-    found = recorded_transitions(data_near(models.Linear(A, B, data=own), infinite), [], infinite)
+    found = recorded_transitions(MODEL, data_near(models.Linear(A, B, data=own), infinite), [], infinite)
     assert found is not None
     assert len(found[0]) == len(own)
 
 
 def test_of_very_many_transitions_a_random_part_is_kept_and_it_is_always_the_same() -> None:
     executed = executions(1) * 300
-    first, second = (recorded_transitions(None, executed, loops()) for _ in range(2))
+    first, second = (recorded_transitions(MODEL, None, executed, loops()) for _ in range(2))
     assert first is not None
     assert second is not None
     assert len(first[0]) == MOST
@@ -170,7 +172,7 @@ def test_logs_are_known_transitions_whose_numbers_follow_those_of_executions() -
         return Trajectory(np.arange(steps + 1.0), rng.normal(size=(steps + 1, 2)), rng.normal(size=(steps, 1)))
 
     executed, logged, loops = walk(5), [walk(4), walk(3)], walk(6)
-    found = recorded_transitions(None, [executed], loops, logged)
+    found = recorded_transitions(MODEL, None, [executed], loops, logged)
     assert found is not None
     assert found[1].tolist() == [0] * 5 + [1] * 4 + [2] * 3
     np.testing.assert_array_equal(found[0].x[5:9], logged[0].states[:-1])
@@ -181,7 +183,7 @@ def test_of_long_logs_the_steps_near_the_tasks_are_kept() -> None:
     states = np.cumsum(rng.normal(size=(5001, 1)), axis=0)
     log = Trajectory(np.arange(5001.0), states, np.zeros((5000, 1)))
     loops = Trajectory(np.arange(3.0), np.full((3, 1), states[100, 0]), np.zeros((2, 1)))
-    found = recorded_transitions(None, [], loops, [log])
+    found = recorded_transitions(MODEL, None, [], loops, [log])
     assert found is not None
     gaps = np.abs(states[:-1, 0] - states[100, 0])
     np.testing.assert_array_equal(np.sort(np.abs(found[0].x[:, 0] - states[100, 0])), np.sort(gaps)[: len(found[0])])

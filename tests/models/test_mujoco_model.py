@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,14 @@ import pytest
 from typer.testing import CliRunner
 
 from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, systems, testing
+from ctxval._util.arrays import Array
 from ctxval.cli import app
 from ctxval.cli.config.parts import part
+from ctxval.core.model import predicted_steps, with_memory
+from ctxval.core.trajectory import Transitions
 from ctxval.data import recordings_of
 from ctxval.data.log import MemoryTable
-from ctxval.errors import InputError, ModelError, ShapeError
+from ctxval.errors import ExecutionError, InputError, ModelError, ShapeError
 from ctxval.studies.fitting import fit
 
 mujoco = pytest.importorskip("mujoco")
@@ -121,11 +125,7 @@ def test_it_is_the_model_of_a_campaign_and_repeats_itself_in_a_store(tmp_path: P
         (mjcf(0.1), {"dt": 0.0125}, "dt must be a multiple of the model's timestep, 0.005 s, got 0.0125 s"),
         (mjcf(0.1), {"dt": -1}, "dt must be a positive number"),
         ("missing.xml", {}, "missing.xml"),
-        (
-            mjcf(0.1).replace("<motor name", '<general dyntype="integrator" name'),
-            {},
-            "the model has 1 activations, which are no part of the state",
-        ),
+        (mjcf(0.1), {"sites": "tip"}, "site"),
     ],
 )
 def test_what_cannot_be_a_model_is_refused(given: str, options: dict[str, Any], said: str) -> None:
@@ -136,6 +136,99 @@ def test_what_cannot_be_a_model_is_refused(given: str, options: dict[str, Any], 
 def test_states_and_inputs_have_the_numbers_of_the_model() -> None:
     with pytest.raises(ShapeError, match="1 qpos, 1 qvel and 1 inputs, got 3 states and 1 inputs"):
         models.MuJoCo(mjcf(0.1)).step(np.zeros(3), np.zeros(1))
+
+
+# One engine as M and as S
+
+# A walker that falls onto the ground, with the solver's settings of fast simulations; its second motor has a filter.
+WALKER = """<mujoco><option timestep="0.005" iterations="1" ls_iterations="4"/><worldbody>
+  <geom type="plane" size="5 5 0.1"/><body pos="0 0 0.35"><freejoint/><geom type="capsule" fromto="-0.2 0 0 0.2 0 0"
+  size="0.05"/><site name="tip" pos="0.2 0 0"/>
+  <body pos="-0.2 0 0"><joint name="a" axis="0 1 0" damping="0.05"/><geom type="capsule" fromto="0 0 0 0 0 -0.3"
+  size="0.03"/></body>
+  <body pos="0.2 0 0"><joint name="b" axis="0 1 0" damping="0.05" frictionloss="0.1" range="-60 60" limited="true"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03"/></body></body></worldbody>
+  <actuator><motor joint="a" gear="2"/><general joint="b" dyntype="filterexact" dynprm="0.05" gainprm="3"/></actuator>
+</mujoco>"""
+
+
+def walk(t: int, x: Array) -> Array:
+    swing = np.broadcast_to(np.sin(0.2 * t), x.shape[:-1])
+    return np.stack([swing - 2 * x[..., 7], -swing - 2 * x[..., 8]], axis=-1)
+
+
+def walking(**parts: Any) -> Validation:
+    system = systems.MuJoCo(WALKER, substeps=2, sites="tip", axes="xz")
+    height = np.array([0, 0, 1, 0, 0, 0, 0, 0, 0.0])
+    given: dict[str, Any] = {
+        "space": TaskSpace(height=(0.3, 0.5, "m")),
+        "task": lambda p: Task(
+            system.state([0, 0, 0, 1, 0, 0, 0, 0.1, -0.1] + np.asarray(p.height)[..., None] * height),
+            horizon=40,
+            dt=system.dt,
+        ),
+        "system": system,
+        "model": models.MuJoCo(WALKER, dt=system.dt, sites="tip", axes="xz"),
+        "synthesizer": controllers.Policy(lambda t, x, task: walk(t, x)),
+        "distance": distances.MaximumDeviation(),
+    }
+    return Validation(**{**given, **parts})
+
+
+def test_one_mjcf_as_model_and_as_system_has_the_distance_0() -> None:
+    validation, heights = walking(), np.array([[0.3], [0.35], [0.5]])
+    assert validation.distances(heights).tolist() == [0.0, 0.0, 0.0]  # in a batch
+    assert [validation.outcome(height).distance for height in heights] == [0.0, 0.0, 0.0]
+    on_model = validation.on_model(distances.MaximumDeviation())
+    assert on_model.distances(heights).tolist() == [0.0, 0.0, 0.0]
+    # Steps from recorded states alone lack activations and warm starts.
+    x = validation.plan(heights[0]).model_trajectory.states
+    alone = validation.model.step(x[:-1], np.stack([walk(t, state) for t, state in enumerate(x[:-1])]))
+    assert np.abs(alone - x[1:]).max() > 1e-3
+
+
+def test_a_controller_with_memory_and_another_model_differ_as_they_should() -> None:
+    heavier = models.MuJoCo(WALKER.replace('gear="2"', 'gear="2.2"'), dt=0.01, sites="tip", axes="xz")
+    assert walking(model=heavier).outcome([0.35]).distance > 1e-3
+
+
+def test_recorded_steps_of_the_same_engine_leave_no_residual() -> None:
+    validation = walking()
+    plan = validation.plan([0.4])
+    recorded = with_memory(validation.model, validation.execute(plan))
+    assert (predicted_steps(validation.model, recorded) == recorded.x_next).all()
+    assert (predicted_steps(validation.model, recorded[10:20]) == recorded.x_next[10:20]).all()
+    data = replace(recorded, memory=None)
+    both = predicted_steps(validation.model, Transitions.joined([recorded, data]))
+    assert (both[: len(recorded)] == recorded.x_next).all()
+    np.testing.assert_array_equal(both[len(recorded) :], validation.model.step(data.x, data.u))
+
+
+def test_an_instability_of_both_is_agreement_and_of_one_a_counterexample(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warnings into the working directory
+    unstable = mjcf(0.0).replace("damping", 'stiffness="-1e9" damping')
+    parts: dict[str, Any] = {
+        "space": TaskSpace(start=(0.1, 0.2)),
+        "task": lambda p: Task([p.start, 0.0], horizon=30, dt=0.005),
+        "synthesizer": controllers.Policy(lambda t, x, task: 0 * x[..., :1]),
+        "distance": distances.MaximumDeviation(),
+        "system": systems.MuJoCo(unstable),
+    }
+    both = Validation(model=models.MuJoCo(unstable), **parts)
+    assert both.outcome([0.15]).distance == 0.0
+    assert both.plan([0.15]).model_trajectory.horizon < 30
+    assert both.distances([[0.1], [0.2]]).tolist() == [0.0, 0.0]
+    with pytest.raises(ExecutionError, match=r"^terminated: MuJoCo warned of BADQACC at step \d+$"):
+        Validation(model=models.MuJoCo(mjcf(0.0)), **parts).outcome([0.15])
+
+
+def test_a_step_without_memory_lets_the_solver_converge() -> None:
+    model, many = (models.MuJoCo(WALKER.replace('iterations="1" ls_iterations="4"', s)) for s in ("", 'iterations="1"'))
+    x = walking().plan([0.4]).model_trajectory.states[30, :17]
+    u = np.zeros(2)
+    np.testing.assert_allclose(model.step(x, u), many.step(x, u), atol=1e-6)
 
 
 @pytest.mark.thorough

@@ -110,6 +110,7 @@ def cart(x: Array, u: Array, dt: float = 0.1, mass: float = 2.0) -> Array:
 
 
 def built(folder: Path, tool: str, source: str) -> Path:
+    """Return the FMU of a class Cart."""
     script = folder / f"cart_{tool}.py"
     script.write_text(textwrap.dedent(source))
     command = [sys.executable, "-m", tool, "build", "-f", str(script), "-d", str(folder), "--no-external-tool"]
@@ -384,6 +385,90 @@ def test_states_must_be_real_numbers(fmi2: Path) -> None:
         FMU(fmi2, states=["teeth"], inputs=["force"])
 
 
+# What may be set at the start
+
+ROOM_2 = '''
+from pythonfmu import Fmi2Causality, Fmi2Initial, Fmi2Slave, Fmi2Variability, Real
+
+class Cart(Fmi2Slave):
+    """A room whose temperature is calculated in the first step, from a parameter, with its deviation from 20."""
+
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.T, self.above, self.heat, self.T_start, self.gain, self.begun = 20.0, 0.0, 0.0, 20.0, 0.05, False
+        for name in ("T", "above"):
+            self.register_variable(Real(name, causality=Fmi2Causality.output, initial=Fmi2Initial.calculated))
+        self.register_variable(Real("heat", causality=Fmi2Causality.input, start=0.0))
+        for name in ("T_start", "gain"):
+            self.register_variable(Real(name, causality=Fmi2Causality.parameter, variability=Fmi2Variability.fixed))
+
+    def do_step(self, time, dt):
+        if not self.begun:
+            self.T, self.begun = self.T_start, True
+        self.T += dt * (0.01 * (10 - self.T) + self.gain * self.heat)
+        self.above = self.T - 20
+        return True
+'''
+ROOM_3 = (
+    ROOM_2.replace("Fmi2", "Fmi3").replace("pythonfmu", "pythonfmu3").replace("Real", "Float64")
+    .replace("initial=Fmi3Initial.calculated", "initial=Fmi3Initial.calculated, variability=Fmi3Variability.continuous")
+    .replace("self.T, self.above", "self.time, self.T, self.above").replace("= 20.0, 0.0, 0.0", "= 0.0, 20.0, 0.0, 0.0")
+    .replace("        for name in (\"T\"", """        self.register_variable(
+            Float64("time", causality=Fmi3Causality.independent, variability=Fmi3Variability.continuous))
+        for name in (\"T\"""", 1)
+    .replace("variability=Fmi3Variability.fixed", "variability=Fmi3Variability.fixed, start=getattr(self, name)")
+)  # fmt: skip
+
+
+@pytest.fixture(params=["pythonfmu", *more("pythonfmu3")], scope="module")
+def room(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip(request.param)
+    source = ROOM_2 if request.param == "pythonfmu" else ROOM_3
+    return built(tmp_path_factory.mktemp("room"), request.param, source)
+
+
+def heated(system: FMU, *start: float) -> list[float]:
+    task = Task(list(start), horizon=2, dt=1.0)
+    return [round(x, 9) for x in system.execute(lambda t, x: np.array([2.0]), task).states[:, 0]]
+
+
+@pytest.mark.parametrize("options", [{"start": {"T": "T_start"}}, {"parameters": {"T_start": 15.0}}])
+def test_a_parameter_sets_a_state_that_is_calculated(room: Path, options: dict[str, Any]) -> None:
+    system = FMU(room, states=["T"], inputs=["heat"], **options)
+    assert heated(system, 15.0) == heated(system, 15.0) == [15.0, 15.05, 15.0995]
+    with pytest.raises(ShapeError, match="the task must have the system's 1 states, got 2"):
+        heated(system, 15.0, 0.0)
+
+
+def test_a_calculated_state_without_its_parameter_is_refused_unless_it_starts_there(room: Path) -> None:
+    system = FMU(room, states=["T"], inputs=["heat"])
+    with pytest.raises(InputError, match=r"stands at \[(20|19\.9).*calculates T.*\['T_start', 'gain'\]"):
+        heated(system, 15.0)
+    assert heated(system, 20.0) == [20.0, 20.0, 20.0]
+    with pytest.raises(InputError, match=r"stands at \[(20|19\.9)"):
+        heated(FMU(room, states=["T"], inputs=["heat"], start={"T": "gain"}), 15.0)
+
+
+def test_a_state_that_follows_from_others_must_be_so_in_the_task(room: Path) -> None:
+    system = FMU(room, states=["T", "above"], inputs=["heat"], start={"T": "T_start"})
+    assert heated(system, 15.0, -5.0) == [15.0, 15.05, 15.0995]
+    with pytest.raises(InputError, match=r"stands at \[1[45]\.\d*, -[45]"):
+        heated(system, 15.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"start": {"T": "above"}}, r"start must .*got above \(causality output, continuous, initial calculated\)"),
+        ({"parameters": {"above": 1.0}}, r"parameters must name variables with a start value, got above"),
+        ({"inputs": ["T_start"]}, r"inputs or tunable parameters of the FMU, got T_start \(causality parameter, fixed"),
+    ],
+)
+def test_what_the_description_does_not_allow_is_refused(room: Path, options: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        FMU(room, **{"states": ["T"], "inputs": ["heat"], **options})
+
+
 @pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_an_initial_state_that_is_not_taken_is_an_error(path: Path) -> None:
     # The start values go to the mass, so that the position stays where it was.
@@ -407,7 +492,7 @@ def test_start_values_that_are_refused_are_an_error(fmi2: Path, monkeypatch: pyt
         unit.begin([1.0, 2.0], 0.1, 1)
     assert caught.value.args[1]
     with pytest.raises(fmu_process.Refused, match=r"a\.fmu cannot be initialised: calculated"):
-        unit.begin(None, 0.1, 1)
+        unit.begin([None, None], 0.1, 1)
 
 
 def unpacked(path: Path) -> Path:
@@ -425,7 +510,7 @@ def test_an_fmu_may_end_the_simulation(fmi3: Path, monkeypatch: pytest.MonkeyPat
     unit = fmu_process.Unit(str(unpacked(fmi3)), "a.fmu", [1, 2], [3], ["position", "speed"], {"mass": 3.0})
     assert unit.begin([1.0, 2.0], 0.1, 1) == [1.0, 2.0]
     answers = [unit.advance([0.0]) for _ in range(4)]
-    assert [reason for _, reason in answers] == ["", "", "", "the FMU terminated the simulation"]
+    assert [reason for _, reason in answers] == ["", "", "", "terminated: the FMU ended the simulation"]
     assert answers[-1][0] is None
     unit.free()
 
@@ -558,6 +643,20 @@ type = "FinalState"
 [search]
 name = "gp-ucb"
 """
+
+
+@pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
+def test_one_fmu_as_model_and_as_system_has_the_distance_0(path: Path) -> None:
+    one, system = FMU(path, **NAMES), FMU(path, **NAMES)
+    validation = Validation(
+        space=TaskSpace(start=(0.5, 1.0)),
+        task=lambda p: Task([p.start, -0.5], horizon=10, dt=0.1),
+        system=system,
+        model=lambda x, u: one.execute(lambda t, _: u, Task(x, horizon=1, dt=0.1)).final_state,
+        synthesizer=controllers.Policy(lambda t, x, task: feedback(t, x), vectorized=False),
+        distance=distances.MaximumDeviation(),
+    )
+    assert validation.distances([[0.5], [1.0]]).tolist() == [0.0, 0.0]
 
 
 @pytest.mark.thorough

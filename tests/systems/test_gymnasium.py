@@ -88,7 +88,7 @@ def test_an_environment_is_used_itself_and_copied_for_another_execution_at_the_s
 
 def test_a_terminated_episode_ends_the_trajectory() -> None:
     trajectory = Gymnasium("InvertedPendulum-v5").execute(idle, PENDULUM)
-    assert trajectory.ended == "the environment terminated the episode at step 7"
+    assert trajectory.ended == "terminated: the environment ended the episode at step 7"
     assert np.isfinite(trajectory.states[:8]).all()
     assert abs(trajectory.states[7, 1]) > 0.2  # what the environment calls fallen
     assert np.isnan(trajectory.states[8:]).all()

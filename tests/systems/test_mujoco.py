@@ -194,7 +194,7 @@ def test_a_diverging_simulation_is_told_from_a_healthy_one(tmp_path: Path, monke
     system = systems.MuJoCo(UNSTABLE)
     task = Task(system.state([[0.0], [0.1], [0.0]]), horizon=30, dt=0.05)
     trajectory = system.execute(lambda t, x: np.zeros((*x.shape[:-1], 1)), task)
-    assert trajectory.ended == "MuJoCo warned of BADQACC at step 2"
+    assert trajectory.ended == "terminated: MuJoCo warned of BADQACC at step 2"
     assert trajectory.finite.tolist() == [True, False, True]
     assert np.isnan(trajectory.states[1, 2:]).all()
     alone = system.execute(lambda t, x: np.zeros(1), task[1])
@@ -230,7 +230,7 @@ def test_a_diverged_execution_is_a_failed_trial(tmp_path: Path, monkeypatch: pyt
     )
     assert np.isnan(broken.distances([[0.0], [0.1]])).tolist() == [False, True]
     campaign = Campaign(broken, search=searches.Random()).run(3)
-    assert [trial.failure for trial in campaign.failed] == ["MuJoCo warned of BADQACC at step 2"] * 3
+    assert [trial.failure for trial in campaign.failed] == ["terminated: MuJoCo warned of BADQACC at step 2"] * 3
 
 
 # What the user may get wrong

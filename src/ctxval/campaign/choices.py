@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,9 +11,9 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call, fields_of, lines, shown
 from ctxval._util.texts import text_of
-from ctxval.core.plan import Plan, least_distance, recorded_before_failure
-from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import AT_LEAST, Origin, State, Trial
+from ctxval.core.plan import Plan, ended_early, least_distance, recorded_before_failure, recorded_until_end
+from ctxval.core.trajectory import COMPLETE, Trajectory
+from ctxval.core.trial import AT_LEAST, ENDED, Origin, State, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import DistanceError, InputError
 
@@ -68,6 +68,8 @@ class Execution:
     failed: str | None = None  #: the reason why there is no result: the system failed, or the execution took too long
     at_least: float | None = None  #: what the distance of a failed execution is at least; None if nothing is known
     unusable: str | None = None  #: the reason why the distance function gave no usable number
+    #: the seconds after which the closed loops of M and S ended by a fall or an instability, None for one that did not
+    ends: tuple[float | None, float] | None = None
     lost: str | None = None  #: the reason why the worker was lost, which is not a failure of the system
     seconds: float | None = None  #: the duration, if it is known
 
@@ -100,17 +102,32 @@ class Execution:
             return replace(ended, seconds=self.seconds)
         if self.failed is not None or self.distance is not None:
             return self
+        run, of_model = self.trajectory, plan.model_trajectory
+        if isinstance(run, Trajectory) and ended_early(plan, run):
+            tolerance = validation.start_tolerance if start_tolerance is None else start_tolerance
+            run = recorded_until_end(plan, run, tolerance)
+            alone = of_model.ended == COMPLETE
+            end, end_of_model = (float(part.times[-1] - part.times[0]) for part in (run, of_model))
+            ended = replace(self, trajectory=run if run.horizon else None, ends=(None if alone else end_of_model, end))
+            if alone:
+                return replace(ended, failed=run.ended)
+            return ended._with_distance(lambda: validation.measure(plan, run))
+        return self._with_distance(lambda: validation.accept(plan, run, start_tolerance))
+
+    def _with_distance(self, measured: Callable[[], float]) -> Execution:
         try:
-            return replace(self, distance=validation.accept(plan, self.trajectory, start_tolerance))
+            return replace(self, distance=measured())
         except DistanceError as error:
             return replace(self, unusable=text_of(error))
 
     def ended(self, trial: Trial, *, executed: bool = True) -> Trial:
         """Return a trial in the final state that this measured execution gives it."""
         state: State = "failed" if self.failed is not None else "unmeasured" if self.distance is None else "completed"
-        note = {key: value for key, value in (trial.note or {}).items() if key != AT_LEAST}
+        note = {key: value for key, value in (trial.note or {}).items() if key not in (AT_LEAST, ENDED)}
         if self.at_least is not None:
             note[AT_LEAST] = self.at_least
+        if self.ends is not None:
+            note[ENDED] = dict(zip(("model", "system"), self.ends, strict=True))
         failure = self.unusable if self.failed is None else text_of(self.failed)
         ended = replace(trial, state=state, executed=executed, distance=self.distance, failure=failure)
         return replace(ended, seconds=self.seconds, note=note or None)

@@ -16,7 +16,7 @@ from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import AHEAD, SerialPool, WorkerPool
 from ctxval.core.plan import start_offset
-from ctxval.core.trajectory import Trajectory
+from ctxval.core.trajectory import DIVERGED, TERMINATED, Trajectory
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import CampaignError, CtxvalError, ExecutionError, InputError, StoreError
 
@@ -177,8 +177,8 @@ class ExecutionLoop:
         if len(failed) < fewest:
             return None
         reasons = {re.sub(r"[-+.\d]+", "", trial.failure or "") for trial in failed}
-        if len(reasons) > 1 or reasons.pop().startswith("diverged"):
-            return None  # a loop that diverges is a property of the system
+        if len(reasons) > 1 or reasons.pop().startswith((DIVERGED, TERMINATED)):
+            return None  # a loop that ends is a property of the system
         reason = (failed[-1].failure or "").rstrip(".")
         remedy = "Correct the experiment (`ctxval check` with --execute tries one task)"
         if which != "all":
@@ -201,7 +201,7 @@ class ExecutionLoop:
             with suppress(InputError):
                 failed = Execution.before_failure(validation, opened.plan, execution.trajectory, str(error))
             execution = replace(failed, seconds=execution.seconds)
-        if execution.failed is not None:
+        if execution.failed is not None and execution.ends is None:  # a fall is no failure to repeat
             self.failures[opened.number] += 1
             if self.failures[opened.number] <= self.retry_failures:
                 return None
@@ -219,7 +219,9 @@ def _result(recorder: TrialRecorder, ended: Trial, executed: Trajectory | None) 
         parts.append(f"predicted {predicted.median:.4g}" + (f" ± {predicted.deviation:.1g}" if visible else ""))
     if ended.distance is None:
         parts.append(f"failed: {ended.failure}")
-        if ended.least:
+        if ended.ended_alone is not None:
+            parts.append(f"S ended after {ended.ended_alone:.3g} s, and M did not")
+        elif ended.least:
             parts.append(f"at least {ended.least:.4g} {validation.labels.units}".rstrip())
     else:
         parts.append(f"executed {ended.distance:.4g} {validation.labels.units}".rstrip())

@@ -213,14 +213,14 @@ def remeasure(store: Store, validation: Validation, description: dict[str, Any])
 
 def _measured(trial: Trial) -> dict[str, Any]:
     """Return the fields of a trial that a new measurement can change."""
-    of_failed = {AT_LEAST: trial.least} if trial.state == "failed" else {}
+    of_failed = {AT_LEAST: trial.least} if trial.state == "failed" and trial.ended_alone is None else {}
     return {"state": trial.state, "distance": trial.distance, "failure": trial.failure, **of_failed}
 
 
 def _measured_again(store: Store, validation: Validation, trial: Trial) -> Trial:
     advance()
     model, system = store.trajectory(trial.number, "model"), store.trajectory(trial.number, "system")
-    if trial.state == "open" or model is None or system is None:
+    if trial.state == "open" or model is None or system is None or trial.ended_alone is not None:
         return trial
     point = validation.space.point(trial.parameters)
     if trial.state == "failed":

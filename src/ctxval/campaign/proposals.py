@@ -26,6 +26,7 @@ from ctxval.campaign.costs import costs_of
 from ctxval.campaign.dynamics import PREDICTION, CampaignDynamics
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates.prediction_tests import TESTS
+from ctxval.core.model import Step, run_of
 from ctxval.core.rollout import rollout
 from ctxval.core.trial import CONVERGED, UNSTEADY, Trial, Trials
 from ctxval.core.validation import Validation
@@ -96,8 +97,10 @@ class Steadiness:
             ranges = np.ptp(planned.promised.states.reshape(-1, planned.promised.states.shape[-1]), axis=0)
             ranges = np.maximum(ranges, 1e-3 * ranges.max())
 
-            def step(x: Array, u: Array, push: Array = 0.01 * ranges) -> Array:
-                return np.asarray(model.step(x, u) + push)
+            run = run_of(model, planned.task.initial_state)
+
+            def step(x: Array, u: Array, push: Array = 0.01 * ranges, run: Step = run) -> Array:
+                return np.asarray(run(x, u) + push)
 
             loops = rollout(step, planned.controller, planned.task)
             pushed.append((planned.rows, (loops.states / ranges).reshape(len(planned.rows), -1)))

@@ -44,7 +44,7 @@ def bets_against(trials: Sequence[Trial], threshold: float, quantile: float = QU
 
     It is not if no execution was predicted to be, or if the last one was not, and an excess repeated to the last digit.
     """
-    known = [trial for trial in trials if trial.distance is not None]
+    known = [trial for trial in trials if trial.distance is not None or trial.ended_alone is not None]
     noises = [prediction.get("noise") for trial in trials if (prediction := _prediction(trial))]
     if not any(noises):
         return None
@@ -55,10 +55,10 @@ def bets_against(trials: Sequence[Trial], threshold: float, quantile: float = QU
     whole, repetitions, above = 1.0, 1.0, 0
     for k, trial in enumerate(known):
         before = executions_of(trial, known[:k])
-        repeated = any((earlier.distance or 0.0) > threshold for earlier in before)
+        repeated = any(earlier.least > threshold for earlier in before)
         # It is repeated because it may exceed the threshold again, whatever was predicted.
         chance = _BOLDEST if repeated else float(np.clip(_predicted_chance(trial, threshold), 1 - quantile, _BOLDEST))
-        exceeds = (trial.distance or 0.0) > threshold
+        exceeds = trial.least > threshold
         above += exceeds
         factor = chance / (1 - quantile) if exceeds else (1 - chance) / quantile
         whole *= factor

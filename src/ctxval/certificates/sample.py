@@ -80,7 +80,7 @@ class Sample(ShortRepr):
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
         made_good = list[MadeGood]()
         for trial in trials:
-            if trial.state == "failed" and trial.origin != "iid":
+            if trial.state == "failed" and trial.ended_alone is None and trial.origin != "iid":
                 later = [success for success in executions_of(trial, trials) if success.number > trial.number]
                 by = next((success for success in later if success.because), later[0] if later else None)
                 if by is not None:

@@ -84,7 +84,11 @@ def counterexample(
     if bets is not None and not bets.falsify(confidence):
         return None
     failed = without_success(trials)
-    above = [each for each in trials if each.least > tau and (each.distance is not None or each in failed)]
+    above = [
+        each
+        for each in trials
+        if each.least > tau and (each.distance is not None or each.ended_alone is not None or each in failed)
+    ]
     if not above:
         return None
     worst = max(above, key=lambda trial: (trial.distance is not None, trial.least))

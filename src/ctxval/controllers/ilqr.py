@@ -13,7 +13,7 @@ from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.controllers.lqr import QuadraticCost, QuadraticSynthesizer, linear_gains
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike, fed_back
-from ctxval.core.model import Model, linearize
+from ctxval.core.model import Model, linearize, run_of
 from ctxval.core.task import Task
 from ctxval.errors import DesignError, ModelError
 
@@ -101,8 +101,9 @@ class _Descent:
             self.U = self.limits.clip(self.U)
         self.X = np.empty((task.horizon + 1, batch, n))
         self.X[0] = task.initial_state.reshape(-1, n)
+        step = run_of(model, self.X[0])
         for t in range(task.horizon):
-            self.X[t + 1] = model.step(self.X[t], self.U[t])
+            self.X[t + 1] = step(self.X[t], self.U[t])
         self.J = self.cost.value(self.X - self.reference, self.U)
         if not np.isfinite(self.J).all():
             raise DesignError("iLQR cannot start: the model diverges under zero input within the horizon.")
@@ -197,12 +198,12 @@ class _Descent:
         U = self.U[:, rows[tasks]] + lengths[:, None] * policy.k[:, tasks]
         K = policy.K[:, tasks] if policy.K.ndim == 4 else policy.K
         X = np.empty_like(X_old)
-        X[0] = X_old[0]
+        X[0], step = X_old[0], run_of(self.model, X_old[0])
         for t in range(len(U)):
             U[t] += fed_back(K[t], X[t] - X_old[t])
             if self.limits is not None:
                 U[t] = self.limits.clip(U[t])
-            X[t + 1] = self.model.step(X[t], U[t])
+            X[t + 1] = step(X[t], U[t])
         J = self.cost.value(X - self.reference[:, rows[tasks]], U)
         J = np.where(np.isfinite(J), J, np.inf)
         expected = lengths * policy.slope[tasks] + 0.5 * lengths**2 * policy.curvature[tasks]

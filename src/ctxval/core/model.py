@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
 from ctxval._util.arrays import Array, as_floats, rows_of
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval.errors import InputError, ModelError
+from ctxval.errors import InputError, ModelError, ShapeError
+
+if TYPE_CHECKING:
+    from ctxval.core.trajectory import Trajectory, Transitions
 
 Step = Callable[[Array, Array], Array]
 
@@ -25,6 +29,77 @@ class Model(Protocol):
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
+
+
+@runtime_checkable
+class ModelWithMemory(Model, Protocol):
+    """A model whose next state depends on earlier steps too, such as on activations or the warm start of a solver.
+
+    Each closed loop has a memory of its own, an array ``(..., k)`` with the batch axes of the states. ``step`` predicts
+    one step from a recorded state alone.
+    """
+
+    def start(self, x: Array) -> Array:
+        """Return the memory ``(..., k)`` of closed loops that start in states ``(..., n)``."""
+
+    def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
+        """Return the pair of the next states ``(..., n)`` and the new memory ``(..., k)``; arguments stay unchanged."""
+
+
+def memory_in(model: Model, x: Array) -> Array:
+    """Return the memory of a model at the start of closed loops in states ``(..., n)``; ``(..., 0)`` if it has none."""
+    if not isinstance(model, ModelWithMemory):
+        return np.empty((*x.shape[:-1], 0))
+    memory = np.array(model.start(x), dtype=np.float64)
+    if memory.shape[:-1] != x.shape[:-1] or not memory.ndim:
+        wanted = ", ".join([*map(str, x.shape[:-1]), "k"]) + "," * (x.ndim == 1)
+        raise ShapeError(f"start of the model must return a memory of shape ({wanted}), got {memory.shape}.")
+    return memory
+
+
+def advanced(model: Model, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
+    """Return the next states of a model with memory or without, and its new memory."""
+    return model.advance(x, u, memory) if isinstance(model, ModelWithMemory) else (model.step(x, u), memory)
+
+
+def run_of(model: Model, x: Array) -> Step:
+    """Return the steps of a closed loop that starts in states ``(..., n)``; each run has a memory of its own."""
+    memory = memory_in(model, x)
+    if not memory.shape[-1]:
+        return model.step
+
+    def step(x: Array, u: Array) -> Array:
+        nonlocal memory
+        x_next, memory = advanced(model, x, u, memory)
+        return x_next
+
+    return step
+
+
+def predicted_steps(model: Model, recorded: Transitions) -> Array:
+    """Return the next states ``(N, n)`` that a model predicts for recorded transitions, with its memory if recorded."""
+    predicted, memory = model.step(recorded.x, recorded.u), recorded.memory
+    if memory is None or not isinstance(model, ModelWithMemory):
+        return predicted
+    rows = np.flatnonzero(~np.isnan(memory).any(axis=1))
+    predicted = np.array(predicted)
+    predicted[rows] = advanced(model, recorded.x[rows], recorded.u[rows], memory[rows])[0]
+    return predicted
+
+
+def with_memory(model: Model, recorded: Trajectory, *, started: bool = True) -> Transitions:
+    """Return the transitions of a trajectory with the memory that a model has if it follows the recorded states.
+
+    The memory of the first step is not known if the system was not ``started`` there.
+    """
+    transitions, memory = recorded.transitions(), memory_in(model, recorded.states[..., 0, :])
+    if not memory.shape[-1]:
+        return transitions
+    memories = []
+    for t in range(recorded.horizon):
+        memories.append(np.array(memory) if t or started else np.full_like(memory, np.nan))
+        memory = advanced(model, recorded.states[..., t, :], recorded.inputs[..., t, :], memory)[1]
+    return replace(transitions, memory=rows_of(np.stack(memories, axis=-2)))
 
 
 @part(functions={"step": "(x, u) -> x_next"})

@@ -16,8 +16,8 @@ from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller, started
 from ctxval.core.space import Parameters
 from ctxval.core.task import Task
-from ctxval.core.trajectory import Trajectory, require_times
-from ctxval.errors import CtxvalError, DesignError, DistanceError, InputError, ShapeError
+from ctxval.core.trajectory import COMPLETE, Trajectory, require_times
+from ctxval.errors import CtxvalError, DesignError, DistanceError, ExecutionError, InputError, ShapeError
 
 if TYPE_CHECKING:
     from ctxval.core.validation import Validation
@@ -74,6 +74,48 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
         raise InputError(f"the trajectory starts elsewhere: state {i} must start at {wanted}. {advice}")
 
 
+def require_complete(plan: Plan, trajectory: Trajectory) -> None:
+    """Refuse a trajectory that ended early or is not finite, and one of a task in which M alone ended early."""
+    expected = plan.model_trajectory
+    if trajectory.ended != COMPLETE:
+        raise ExecutionError(trajectory.ended)
+    if expected.ended != COMPLETE:
+        end = f"the model's closed loop ended after {expected.times[-1] - expected.times[0]:.3g} s"
+        raise ExecutionError(f"{end}, and the execution did not: repair the model (`ctxval check` with --aspect1)")
+    if not trajectory.finite.all():
+        unknown, what = np.argwhere(~np.isfinite(trajectory.states)), "an input"
+        if len(unknown):
+            place = tuple(unknown[0])  # of a batch, too, which is refused later if it is finite
+            what = f"state {place[-1]} is {trajectory.states[place]:g} at step {place[-2]}"
+        raise ExecutionError(f"the system's trajectory is not finite: {what}")
+
+
+def ended_early(plan: Plan, trajectory: Trajectory) -> bool:
+    """Return whether the closed loop of a trajectory itself ended early, by its reason or without a state as M."""
+    if trajectory.ended != COMPLETE or plan.model_trajectory.ended == COMPLETE or trajectory.batch_shape:
+        return trajectory.is_outcome
+    return bool(trajectory.predicts and not trajectory.finite)
+
+
+def recorded_until_end(plan: Plan, trajectory: Trajectory, start_tolerance: float) -> Trajectory:
+    """Return the steps of a closed loop that ended early, by a fall or an instability; refuse another task's."""
+    expected = plan.model_trajectory
+    if (trajectory.states.ndim, trajectory.states.shape[-1], trajectory.inputs.shape[-1]) != (
+        (2, expected.states.shape[-1], expected.inputs.shape[-1])
+    ):
+        wanted = f"{expected.states.shape[-1]} states and {expected.inputs.shape[-1]} inputs"
+        raise ShapeError(
+            f"the trajectory must have {wanted}, got {trajectory.states.shape} and {trajectory.inputs.shape}."
+        )
+    recorded = trajectory.first(int(trajectory.lengths))
+    common, compared = min(recorded.horizon, expected.horizon), recorded
+    if not common:  # it ended in its first step, so only its start can be compared
+        states = np.stack([trajectory.states[0], expected.states[1]])
+        common, compared = 1, Trajectory(trajectory.times[:2], states, expected.inputs[:1])
+    require_execution(replace(plan, model_trajectory=expected.first(common)), compared.first(common), start_tolerance)
+    return recorded
+
+
 def recorded_before_failure(plan: Plan, trajectory: object, start_tolerance: float) -> Trajectory:
     """Return the steps of a plan that were recorded before its execution failed; refuse what has none of them."""
     expected = plan.model_trajectory
@@ -98,6 +140,10 @@ def least_distance(validation: Validation, point: ArrayLike, model: Trajectory, 
     It is the distance if S had followed M from there on. Numbers that diverge are cut off where it is not finite.
     """
     if not getattr(validation.distance, "monotone", False):
+        return None
+    if model.ended != COMPLETE:
+        with suppress(DistanceError):
+            return validation.remeasure(point, model, recorded)
         return None
     for steps in range(recorded.horizon, 0, -1):
         states = np.concatenate([recorded.states[: steps + 1], model.states[steps + 1 :]])
@@ -227,6 +273,7 @@ def require_repeatable(validation: Validation, plan: Plan) -> None:
         )
     try:
         again = validation.closed_loop(plan.controller, plan.task)
+        again = again.first(min(int(again.lengths), first.horizon))
     except CtxvalError:
         raise
     except Exception as error:

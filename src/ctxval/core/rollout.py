@@ -9,22 +9,21 @@ import numpy as np
 from ctxval._util.arrays import as_floats
 from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller, started
-from ctxval.core.model import Step
+from ctxval.core.model import Model, Step, run_of
 from ctxval.core.task import Task
-from ctxval.core.trajectory import Trajectory
+from ctxval.core.trajectory import ENORMOUS, Trajectory
 from ctxval.errors import CtxvalError, ShapeError
 
-_ENORMOUS = 1e100  # states from which sums of inputs may overflow
 
-
-def rollout(step: Step, controller: Controller, task: Task, *, partial: bool = False) -> Trajectory:
-    """Run a controller in closed loop with ``x_next = step(x, u)`` over the task's horizon.
+def rollout(model: Model | Step, controller: Controller, task: Task, *, partial: bool = False) -> Trajectory:
+    """Run a controller in closed loop with a model, or with ``x_next = step(x, u)``, over the task's horizon.
 
     A loop that diverges continues with NaN and infinity; it does not stop the other loops of its batch. If it may be
     ``partial``, an exception of the user's parts after the first step ends the trajectory before it.
     """
     with np.errstate(all="ignore"):
         x = np.array(task.initial_state)
+        step = run_of(model, x) if isinstance(model, Model) else model
         pi = started(controller, task)
         u = as_floats("inputs of a controller", pi(0, x.copy()))
         if u.shape[:-1] != x.shape[:-1] or u.ndim != x.ndim:
@@ -61,7 +60,7 @@ def rollout(step: Step, controller: Controller, task: Task, *, partial: bool = F
     bad = ~np.isfinite(flat).all(axis=1)
     first = int(bad.argmax()) if bad.any() else task.horizon
     # NaN for a state that is a number is the controller's doing, unless the loop grew beyond all numbers.
-    ordinary = np.abs(flat[:first]).max(axis=1) < _ENORMOUS
+    ordinary = np.abs(flat[:first]).max(axis=1) < ENORMOUS
     without = ordinary & np.isnan(inputs.reshape(task.horizon, -1)[:first]).any(axis=1)
     if without.any():
         return replace(trajectory, ended=f"got NaN from its controller at step {without.argmax()}")

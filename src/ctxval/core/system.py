@@ -136,7 +136,7 @@ class Simulated(ShortRepr):
 
         If a step of one task raises an exception, the trajectory ends before it.
         """
-        return rollout(self.model.step, controller, task, partial=not task.batch_shape)
+        return rollout(self.model, controller, task, partial=not task.batch_shape)
 
 
 @part(functions={"outputs": "x -> y", "start": "x -> first state"}, parts={"system": "system"})

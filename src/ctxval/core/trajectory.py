@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, Rows, as_floats, held_means, read_only, rows_of
+from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_floats, held_means, read_only, rows_of
 from ctxval._util.columns import (
     EPISODES,
     FAR,
@@ -28,6 +28,9 @@ from ctxval._util.texts import enumerated, guarded, parted, visible
 from ctxval.errors import InputError, ShapeError
 
 COMPLETE = "complete"
+ENORMOUS = 1e100  # states from which sums of inputs may overflow
+TERMINATED, DIVERGED = "terminated", "diverged"
+"""First words of the reason why a closed loop itself ended early: by a fall or an instability, or without bounds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +44,7 @@ class Transitions(ShortRepr):
     u: Array
     x_next: Array
     dt: float | None = None
+    memory: Array | None = None  #: the memory of M in each step ``(N, k)``, NaN if it is not known; None if M has none
 
     def __post_init__(self) -> None:
         for name in ("x", "u", "x_next"):
@@ -50,7 +54,8 @@ class Transitions(ShortRepr):
             raise ShapeError(f"transitions need x (N, n), u (N, m) and x_next (N, n), got {got}.")
 
     def __getitem__(self, rows: slice | Rows | Mask) -> Transitions:
-        return Transitions(self.x[rows], self.u[rows], self.x_next[rows])
+        memory = None if self.memory is None else self.memory[rows]
+        return Transitions(self.x[rows], self.u[rows], self.x_next[rows], memory=memory)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -66,7 +71,9 @@ class Transitions(ShortRepr):
         if steps and not np.allclose(steps, steps[0], rtol=1e-3, atol=0):
             raise InputError(f"recorded steps must have one length, got {min(steps):g} s and {max(steps):g} s.")
         x, u, x_next = (np.concatenate([getattr(part, name) for part in parts]) for name in ("x", "u", "x_next"))
-        return Transitions(x, u, x_next, steps[0] if steps else None)
+        width = max((part.memory.shape[1] for part in parts if part.memory is not None), default=0)
+        memories = [np.full((len(part), width), np.nan) if part.memory is None else part.memory for part in parts]
+        return Transitions(x, u, x_next, steps[0] if steps else None, np.concatenate(memories) if width else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +113,46 @@ class Trajectory:
     def finite(self) -> Mask:
         """Whether every state and input is finite, shape ``(...)``."""
         return np.asarray(np.isfinite(self.states).all(axis=(-1, -2)) & np.isfinite(self.inputs).all(axis=(-1, -2)))
+
+    @property
+    def is_outcome(self) -> bool:
+        """Whether the closed loop itself ended early, by a fall or an instability; a failed execution is none."""
+        return self.ended.startswith((TERMINATED, DIVERGED))
+
+    @property
+    def lengths(self) -> Rows:
+        """The number of steps before the first value that is not finite, shape ``(...)``."""
+        bad = ~(np.isfinite(self.states[..., 1:, :]).all(axis=-1) & np.isfinite(self.inputs).all(axis=-1))
+        return np.where(bad.any(axis=-1), bad.argmax(axis=-1), self.horizon)
+
+    @property
+    def predicts(self) -> Mask:
+        """Whether a closed loop on M is finite, or M had no next state after at least one step, shape ``(...)``.
+
+        A loop that grows without bounds, or whose controller gives NaN, predicts nothing.
+        """
+        if self.finite.all():
+            return self.finite
+        end = self.lengths
+        ended = np.minimum(end, self.horizon - 1)[..., None, None]
+        inputs, before, after = (
+            np.take_along_axis(part, place, axis=-2)[..., 0, :]
+            for part, place in ((self.inputs, ended), (self.states, ended), (self.states, ended + 1))
+        )
+        ordinary = np.abs(before).max(axis=-1, initial=0.0) < ENORMOUS
+        without = np.isfinite(inputs).all(axis=-1) & np.isnan(after).any(axis=-1) & ~np.isinf(after).any(axis=-1)
+        return np.asarray(self.finite | ((end > 0) & ordinary & without))
+
+    def held(self, steps: ArrayLike, times: Array) -> Trajectory:
+        """Return the first steps, as many as ``steps`` ``(...)`` says, with the last state and input held to the end.
+
+        The times ``(H + 1,)`` are those of the whole horizon.
+        """
+        last, t = np.asarray(steps, dtype=np.intp)[..., None], np.arange(len(times))
+        rows, acting = np.minimum(t, last), np.minimum(t[:-1], np.maximum(last - 1, 0))
+        inputs = self.inputs if self.horizon else np.zeros((*self.batch_shape, 1, self.inputs.shape[-1]))
+        states = np.take_along_axis(self.states, rows[..., None], axis=-2)
+        return Trajectory(times, states, np.take_along_axis(inputs, acting[..., None], axis=-2), self.ended)
 
     def copy(self) -> Trajectory:
         """Return the same trajectory with arrays of its own, which may be changed."""

@@ -30,6 +30,12 @@ UNSTEADY = "unsteady"
 
 AT_LEAST = "at_least"  #: key in the note of a failed trial: the distance that the steps before the failure have already
 
+ENDED = "ends"
+"""Key in the note of a trial whose closed loops ended early, by a fall or an instability: when those of M and S did.
+
+The times are in seconds, null for a loop that did not end. If S alone did, M was wrong by more than any distance.
+"""
+
 TOLD_ALONE = "its distance was told without a trajectory, and the distance has changed since: execute the task again."
 """The failure of a trial that was reported without a trajectory, so that a new distance cannot be computed."""
 
@@ -63,9 +69,20 @@ class Trial:
 
     @property
     def least(self) -> float:
-        """What d(p) is at least: the distance, or that of the steps before a failure; 0 if neither is known."""
+        """What d(p) is at least: the distance, or that of the steps before a failure; 0 if neither is known.
+
+        It is infinite if the closed loop of S ended by a fall or an instability, and that of M did not.
+        """
+        if self.ended_alone is not None:
+            return np.inf
         known = (self.note or {}).get(AT_LEAST) if self.distance is None else self.distance
         return float(known) if isinstance(known, int | float) else 0.0
+
+    @property
+    def ended_alone(self) -> float | None:
+        """The seconds after which S fell or became unstable, if M did not; else None."""
+        ended = (self.note or {}).get(ENDED)
+        return float(ended["system"]) if self.state == "failed" and isinstance(ended, dict) else None
 
     def __repr__(self) -> str:
         ended = {"distance": self.distance, "seconds": self.seconds, "attempts": self.attempts}
@@ -143,6 +160,9 @@ def designs_sentence(trials: Sequence[Trial]) -> str | None:
     if failed := designs.count(False):
         where = f"{failed} of {len(designs)} executed tasks{', among them the worst one' if among else ''}"
         parts.append(f"the design of the controller did not converge at {where}")
+    if early := sum(ENDED in (trial.note or {}) for trial in executed if trial.distance is not None):
+        what = f"{early} of {len(executed)} executions ended early on M and S, by a fall or an instability"
+        parts.append(f"{what}, and distances are over the common part")
     rejected = sum(count for trial in trials if isinstance(count := (trial.note or {}).get(UNSTEADY), int))
     if rejected:
         tasks = f"{counted(rejected, 'task')} {'was' if rejected == 1 else 'were'} not executed"

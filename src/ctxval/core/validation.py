@@ -24,7 +24,7 @@ from ctxval.core.controller import Controller, Synthesizer, is_controller
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels, names_of, require_names
 from ctxval.core.model import Model, Step, as_model, require_time_step
-from ctxval.core.plan import Outcome, Plan, require_execution
+from ctxval.core.plan import Outcome, Plan, ended_early, recorded_until_end, require_complete, require_execution
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.system import OutputsLike, Simulated, System, WithOutputs, as_outputs
@@ -146,8 +146,8 @@ class Validation:
     def closed_loop(self, controller: Controller, task: Task) -> Trajectory:
         """Return the closed loop of a controller with M, as it is recorded."""
         if self.outputs is None:
-            return rollout(self.model.step, controller, task)
-        return self.outputs.of(rollout(self.model.step, self.outputs.seen_by(controller), task))
+            return rollout(self.model, controller, task)
+        return self.outputs.of(rollout(self.model, self.outputs.seen_by(controller), task))
 
     def with_parts(self, **changed: Any) -> Validation:
         """Return this validation with other arguments, such as another ``model``, ``distance`` or ``space``."""
@@ -169,11 +169,13 @@ class Validation:
             raise type(error)(f"{str(error).removesuffix('.')} (task {where}).") from error
         if plan.task.batch_shape:
             raise ShapeError(f"the task function made a batch of shape {plan.task.batch_shape} of one point.")
-        if not plan.model_trajectory.finite:
+        run = plan.model_trajectory
+        if not run.predicts:
             where = self.space.describe_point(parameters.points)
-            ended = f"the model's closed loop {plan.model_trajectory.ended} for the task {where}"
+            ended = f"the model's closed loop {run.ended} for the task {where}"
             raise ModelError(f"{ended}: repair the model, or restrict the task space to tasks that it can perform.")
-        return replace(plan, model_trajectory=plan.model_trajectory.frozen())
+        run = run if run.finite else run.first(int(run.lengths))
+        return replace(plan, model_trajectory=run.frozen())
 
     def execute(self, plan: Plan) -> Trajectory:
         """Execute S once."""
@@ -191,19 +193,17 @@ class Validation:
     def require(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> Trajectory:
         """Return a trajectory that is a complete and finite execution of a plan; refuse any other.
 
-        An InputError says that it belongs to another task. A start tolerance replaces that of this validation.
+        If the closed loops of both M and S ended early, by a fall or an instability, it is the steps before. If only
+        one of them did, there is no distance. An InputError says that it belongs to another task. A start tolerance
+        replaces that of this validation.
         """
+        tolerance = self.start_tolerance if start_tolerance is None else start_tolerance
         if not isinstance(trajectory, Trajectory):
             raise ExecutionError(f"the system returned {type(trajectory).__name__} instead of a Trajectory")
-        if trajectory.ended != COMPLETE:
-            raise ExecutionError(trajectory.ended)
-        if not trajectory.finite.all():
-            unknown, what = np.argwhere(~np.isfinite(trajectory.states)), "an input"
-            if len(unknown):
-                place = tuple(unknown[0])  # of a batch, too, which is refused below if it is finite
-                what = f"state {place[-1]} is {trajectory.states[place]:g} at step {place[-2]}"
-            raise ExecutionError(f"the system's trajectory is not finite: {what}")
-        require_execution(plan, trajectory, self.start_tolerance if start_tolerance is None else start_tolerance)
+        if ended_early(plan, trajectory) and plan.model_trajectory.ended != COMPLETE:
+            return recorded_until_end(plan, trajectory, tolerance)
+        require_complete(plan, trajectory)
+        require_execution(plan, trajectory, tolerance)
         return trajectory
 
     def accept(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> float:
@@ -274,9 +274,14 @@ class Validation:
     def distance_between(self, model: Trajectory, system: Trajectory, task: Task) -> Array:
         """Return the distance ``(...)`` of trajectories, which it may not change.
 
+        If they ended early, it is over their common part: from then on, both hold their state.
+
         Raises:
             DistanceError: if the distance fails, or gives no real number.
         """
+        if not task.batch_shape and min(model.horizon, system.horizon) < task.horizon and model.ended != COMPLETE:
+            common = min(model.horizon, system.horizon)
+            model, system = (run.held(common, task.times) for run in (model, system))
         try:
             with np.errstate(all="ignore"):  # some distances change the arrays that they are given
                 values = as_floats("a distance", self.distance(model.copy(), system.copy(), task))
@@ -302,9 +307,11 @@ class Validation:
             got = f"got shape {plan.task.batch_shape}; use the parameters in the task, or broadcast them"
             raise ShapeError(f"the task function must make a batch of {len(points)} tasks of as many points, {got}.")
         expected = plan.model_trajectory
-        if not expected.finite.all():
-            where = self.space.describe_point(points[np.argmin(expected.finite)])
+        if not expected.predicts.all():
+            where = self.space.describe_point(points[np.argmin(expected.predicts)])
             raise ModelError(f"the model's closed loop is not finite for the task {where}.")
+        if not expected.finite.all():  # each end is compared with that of the system
+            return np.array([self._distance_or_nan(self.plan(point)) for point in points])
         try:
             trajectory = self.system.execute(plan.controller, plan.task)
         except Exception:  # only single executions show which task failed

@@ -179,14 +179,17 @@ class LoopPlanner:
         return draws > 1 and bool(self._together)
 
     def compared(self, planned: PlannedTasks, loops: Trajectory) -> Array:
-        """Return the distances ``(q,)`` of loops; infinity if one diverges or cannot be measured, NaN if M diverges."""
+        """Return the distances ``(q,)`` of loops; infinity if one ends alone or is not measured, NaN if M diverges."""
         task, promised, between = planned.task, planned.promised, self.validation.distance_between
         model, system, known = promised, loops, promised.finite & loops.finite
+        if (both := promised.predicts & ~promised.finite & loops.predicts & ~loops.finite).any():  # they ended early
+            common, known = np.minimum(promised.lengths, loops.lengths), known | both
+            model, system = (run.held(common, task.times) for run in (promised, loops))
         if not known.all():  # a distance need not take what is not finite
             kept = known[..., None, None]
             model, system = (
                 Trajectory(run.times, np.where(kept, run.states, 0.0), np.where(kept, run.inputs, 0.0))
-                for run in (promised, loops)
+                for run in (model, system)
             )
         values = np.empty(0)
         with contextlib.suppress(DistanceError):
@@ -198,7 +201,7 @@ class LoopPlanner:
                     alone = between(model[k], system[k], task[k])
                     values[k] = alone if not alone.shape else np.inf
         distances = np.where(known & np.isfinite(values), values, np.inf)
-        return np.where(promised.finite, distances, np.nan).reshape(len(planned.rows))
+        return np.where(promised.predicts, distances, np.nan).reshape(len(planned.rows))
 
 
 def _probed(controller: Controller, task: Task, steps: int) -> Array:

@@ -7,13 +7,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Rows
 from ctxval._util.representation import ShortRepr
-from ctxval.core.model import Model, Step
+from ctxval.core.model import Model, Step, advanced, memory_in, run_of
 from ctxval.learning.dry_friction import DryFriction
 from ctxval.learning.kernel_expansion import KernelExpansion
 from ctxval.learning.residual_data import ResidualData
@@ -69,14 +69,16 @@ class DrawsWithoutNoise(Draws):
         """Return the states, and the step of those draws; see :meth:`Draws.begun`."""
         first, last = int(rows.min()) // tasks, int(rows.max()) // tasks + 1
         needed, here = self[np.arange(first, last)], rows.ravel() - first * tasks
+        if start.ndim == 1 or len(here) == len(needed) * tasks:
+            return start, run_of(needed, start)
 
-        def step(x: Array, u: Array) -> Array:
-            # A flat batch has some rows of all tasks of these draws.
-            whole = [np.zeros((len(needed) * tasks, part.shape[-1])) for part in (x, u)]
-            whole[0][here], whole[1][here] = x, u
-            return np.asarray(needed.step(*whole)[here])
+        def whole(part: Array) -> Array:  # a flat batch has some rows of all tasks of these draws
+            filled = np.zeros((len(needed) * tasks, part.shape[-1]))
+            filled[here] = part
+            return filled
 
-        return start, needed.step if start.ndim == 1 or len(here) == len(needed) * tasks else step
+        run = run_of(needed, whole(start))
+        return start, lambda x, u: np.asarray(run(whole(x), whole(u))[here])
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,16 +110,32 @@ class DynamicsDraws(DrawsWithoutNoise):
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next states; see :class:`DrawsWithoutNoise`."""
+        return self._following(x, u, None)[0]
+
+    def start(self, x: Array) -> Array:
+        """Return the memory of M at the start of closed loops in states ``(..., n)``."""
+        return memory_in(self.model, x)
+
+    def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
+        """Return the next states and the memory of M, as :class:`ctxval.core.model.ModelWithMemory`."""
+        following, memory = self._following(x, u, memory)
+        return following, memory
+
+    def _following(self, x: Array, u: Array, memory: Any) -> tuple[Array, Any]:
         shape = x.shape
         of_each = math.prod(shape[:-1]) // len(self)
-        x, u = (part.reshape(len(self), of_each, part.shape[-1]) for part in (x, u))  # there may be no inputs
-        acting = u[..., : self.data.inputs]
+        # There may be no inputs.
+        x, u, acting = (part.reshape(len(self), of_each, part.shape[-1]) for part in (x, u, u[..., : self.data.inputs]))
         with np.errstate(all="ignore"):
             if isinstance(self.model, DryFriction):
                 following = self.model.following(x, acting, lambda inputs: self.residuals(x, inputs))
-            else:
+            elif memory is None:
                 following = self.model.step(x, acting) + self.residuals(x, acting)
-            return following.reshape(shape)
+            else:
+                given = memory.reshape(*x.shape[:2], memory.shape[-1])
+                following, given = advanced(self.model, x, acting, given)
+                following, memory = following + self.residuals(x, acting), given.reshape(memory.shape)
+            return following.reshape(shape), memory
 
     def residuals(self, x: Array, u: Array) -> Array:
         """Return the residuals ``(S, q, n)`` at states ``(S, q, n)`` and acting inputs ``(S, q, m)``."""
@@ -151,9 +169,20 @@ class DisturbedDynamics(DrawsWithoutNoise):
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next states; see :class:`DrawsWithoutNoise`."""
+        return self._moved(x, self.mean.step(x, u))
+
+    def start(self, x: Array) -> Array:
+        """Return the memory of M at the start of closed loops in states ``(..., n)``."""
+        return self.mean.start(x)
+
+    def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
+        """Return the next states and the memory of M, as :class:`ctxval.core.model.ModelWithMemory`."""
+        x_next, memory = self.mean.advance(x, u, memory)
+        return self._moved(x, x_next), memory
+
+    def _moved(self, x: Array, x_next: Array) -> Array:
         together = x.reshape(len(self), math.prod(x.shape[:-1]) // len(self), x.shape[-1])
-        moved = self.mean.step(x, u).reshape(together.shape) + self.added(self.ways, together)
-        return np.asarray(moved.reshape(x.shape))
+        return np.asarray((x_next.reshape(together.shape) + self.added(self.ways, together)).reshape(x.shape))
 
 
 def bounded(z: Array) -> Array:

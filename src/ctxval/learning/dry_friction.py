@@ -157,7 +157,7 @@ class DryFriction:
         directions = _directions(transitions, self.rates)
         limits = self._limits(transitions.u, transitions.x[:, self.rates], transitions.x_next[:, self.rates])
         acting = transitions.u - limits * directions
-        return Transitions(transitions.x, acting, transitions.x_next), (directions != 0).all(axis=1)
+        return replace(transitions, u=acting), (directions != 0).all(axis=1)
 
 
 def found_friction(model: Model, transitions: Transitions) -> DryFriction | None:

@@ -280,7 +280,7 @@ class DynamicsStudy(ShortRepr):
         # The data that M was made from tell no earlier inputs.
         data = self._data if with_data and self.actuator is None else None
         loops = [replace(loop, inputs=self.extended.acting(loop)) for _, loop in executed]
-        return recorded_transitions(data, loops, self.extended.loops, logged)
+        return recorded_transitions(self.validation.model, data, loops, self.extended.loops, logged)
 
     def _with_parameter(self, name: str) -> DynamicsStudy:
         if name not in self._others:

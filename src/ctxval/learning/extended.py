@@ -22,7 +22,7 @@ from ctxval._util.arrays import Array, single_threaded
 from ctxval.core.controller import Controller, Synthesizer, seeing
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels, labels_of
-from ctxval.core.model import Model
+from ctxval.core.model import Model, advanced, memory_in
 from ctxval.core.space import Parameters
 from ctxval.core.system import Outputs
 from ctxval.core.task import Task
@@ -230,6 +230,14 @@ class _ExtendedModel:
         n = x.shape[-1] - self.k
         following = np.asarray(self.model.step(x[..., :n], u[..., -self.inputs :]))
         return _joined(following, x[..., n:]) if self.k else following
+
+    def start(self, x: Array) -> Array:
+        return memory_in(self.model, x[..., : x.shape[-1] - self.k])
+
+    def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
+        n = x.shape[-1] - self.k
+        following, memory = advanced(self.model, x[..., :n], u[..., -self.inputs :], memory)
+        return (_joined(following, x[..., n:]) if self.k else following), memory
 
 
 @dataclass(frozen=True)

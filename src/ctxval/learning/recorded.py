@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Rows
-from ctxval.core.model import Model
+from ctxval.core.model import Model, with_memory
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
 from ctxval.learning.histories import Record
@@ -26,17 +26,21 @@ def data_near(model: Model, loops: Trajectory) -> Transitions | None:
 
 
 def recorded_transitions(
-    data: Transitions | None, executed: Sequence[Trajectory], loops: Trajectory, logged: Sequence[Trajectory] = ()
+    model: Model,
+    data: Transitions | None,
+    executed: Sequence[Trajectory],
+    loops: Trajectory,
+    logged: Sequence[Trajectory] = (),
 ) -> tuple[Transitions, Rows] | None:
     """Return the known transitions of the system and the execution of each; -1 for data that the model was made from.
 
     Returns None if there are none. Of many transitions, a random part is returned, and of recordings that belong to no
     task, those near closed loops on M; the numbers of these recordings follow those of the executions.
     """
-    parts = [trajectory.transitions() for trajectory in executed]
+    parts = [with_memory(model, trajectory) for trajectory in executed]
     sources = [np.full(len(part), k) for k, part in enumerate(parts)]
     if logged:
-        others = [trajectory.transitions() for trajectory in logged]
+        others = [with_memory(model, trajectory, started=False) for trajectory in logged]
         of = np.repeat(len(executed) + np.arange(len(others)), [len(part) for part in others])
         together = Transitions.joined(others)
         rows = _nearest(together, loops, 1500, many=True)

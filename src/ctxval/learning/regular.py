@@ -21,7 +21,7 @@ from itertools import combinations
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows, single_threaded
-from ctxval.core.model import Model
+from ctxval.core.model import Model, predicted_steps
 from ctxval.core.trajectory import Transitions
 from ctxval.learning.closed_loops import Loops
 from ctxval.learning.dynamics_posterior import (
@@ -110,7 +110,7 @@ def _is_regular(posterior: DynamicsPosterior, transitions: Transitions, regular:
     learned = data.learned
     with single_threaded(), np.errstate(all="ignore"):
         pairs = data.standardised(transitions.x, transitions.u)
-        residuals = (transitions.x_next - posterior.covariances.model.step(transitions.x, transitions.u))[:, learned]
+        residuals = (transitions.x_next - predicted_steps(posterior.covariances.model, transitions))[:, learned]
         errors = np.abs(residuals / data.sizes[learned] - most.mean(pairs[None])[0])
         sizes = np.sqrt(most.squares / len(most.centres))
         doubts = np.sqrt(np.maximum(most.whitened(pairs)[1], 0.0))[:, None] * sizes

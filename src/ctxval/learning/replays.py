@@ -63,7 +63,7 @@ def _replayed(study: DynamicsStudy, model: DynamicsDraws | None, point: Array) -
         return nothing
     try:
         promised = validation.closed_loop(controller, task)
-        predicted = rollout(model.step, controller, task)
+        predicted = rollout(model, controller, task)
         distance = float(validation.distance_between(promised, predicted, task))
     except Exception:  # the same
         return nothing

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
-from ctxval.core.model import Model
+from ctxval.core.model import Model, predicted_steps
 from ctxval.core.trajectory import Transitions
 from ctxval.learning.dry_friction import DryFriction
 from ctxval.learning.hyperparameters import FAMILIES, ResidualKernel, climbed, learning_rows
@@ -79,7 +79,7 @@ def residual_data(
         transitions, moving = model.acting(transitions)
         model = model.model
     with np.errstate(all="ignore"):
-        residuals = transitions.x_next - model.step(transitions.x, transitions.u)
+        residuals = transitions.x_next - predicted_steps(model, transitions)
         steps = transitions.x_next - transitions.x
     pairs = np.concatenate([transitions.x, transitions.u], axis=1)
     # Larger numbers have diverged, and their squares would not be finite.

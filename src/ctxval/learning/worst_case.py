@@ -202,7 +202,7 @@ class WorstCaseSearch:
                 values = self._distances(posterior.mean, elites)[0]
             order = np.argsort(-values, kind="stable")
             highest, elites, evaluations = float(values[order[0]]), elites[order], evaluations + len(elites)
-        unplanned = 1 - sum(int(np.sum(plan.promised.finite)) for plan in self.plans) / len(self.pool)
+        unplanned = 1 - sum(int(np.sum(plan.promised.predicts)) for plan in self.plans) / len(self.pool)
         loops = len(self.pool) + evaluations
         return WorstCase(np.array([highest]), elites[:1], highest, elites, loops, 0.0, unplanned)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask, as_finite, rows_of
 from ctxval._util.representation import ShortRepr
-from ctxval.core.model import Model, linearize
+from ctxval.core.model import Model, advanced, linearize, memory_in
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.increments import standardised_pairs
@@ -111,6 +111,15 @@ class Corrected(ShortRepr):
     def step(self, x: Array, u: Array) -> Array:
         return np.asarray(self.model.step(x, u) + self.correction(x, u))
 
+    def start(self, x: Array) -> Array:
+        """Return the memory of M at the start of closed loops in states ``(..., n)``."""
+        return memory_in(self.model, x)
+
+    def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
+        """Return the next states and the memory of M, as :class:`ctxval.core.model.ModelWithMemory`."""
+        x_next, memory = advanced(self.model, x, u, memory)
+        return np.asarray(x_next + self.correction(x, u)), memory
+
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return A ``(..., n, n)`` and B ``(..., n, m)``, without batch axes if they are those of a linear model M."""
         A, B = linearize(self.model, x, u)
@@ -142,6 +151,14 @@ class Refined(ShortRepr):
 
     def step(self, x: Array, u: Array) -> Array:
         return self.model.step(x, u)
+
+    def start(self, x: Array) -> Array:
+        """Return the memory of the model at the start of closed loops in states ``(..., n)``."""
+        return memory_in(self.model, x)
+
+    def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
+        """Return the next states and the memory of the model, as :class:`ctxval.core.model.ModelWithMemory`."""
+        return advanced(self.model, x, u, memory)
 
 
 def before_refinement(model: Model) -> Model:

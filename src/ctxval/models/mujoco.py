@@ -3,60 +3,77 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from ctxval._util.arrays import Array, rows_of
+from ctxval._util.arrays import Array
 from ctxval._util.checked import Seconds
-from ctxval._util.mjcf import compile_mjcf, is_mjcf_text, quiet
+from ctxval._util.mjcf import Simulator, compile_mjcf, is_mjcf_text, quiet
 from ctxval._util.refusals import require_extra
 from ctxval._util.registry import part
 from ctxval.core.model import paired
 from ctxval.core.trajectory import Transitions
-from ctxval.errors import InputError, ShapeError
+from ctxval.errors import InputError
 
+_CONVERGING = 100  # iterations of the solver after which a step hardly depends on its warm start: MuJoCo's default
 _SYSID = "params_x_hat.yaml"  #: A file that ``mujoco.sysid.save_results`` writes beside the identified models
 
 
 @part(files=("mjcf",))
 class MuJoCo:
-    """An MJCF model as the model M. The state is ``(qpos, qvel)``, and the input is MuJoCo's ``ctrl``.
+    """An MJCF model as the model M. The state is ``(qpos, qvel)`` and coordinates of sites; inputs are ``ctrl``.
 
-    A step is a function of state and input alone: it starts without activations and without a warm start of the
-    constraint solver. A state at which MuJoCo warns (unstable state or acceleration) has no next state; it is NaN.
+    Its closed loops have a memory, as simulations have: activations, the warm start of the constraint solver, states of
+    plugins. So M is exactly :class:`ctxval.systems.MuJoCo` if both have one MJCF. ``step`` predicts from a recorded
+    state without memory: activations have their defaults, and the solver converges. A state at which MuJoCo warns
+    (unstable state or acceleration) has no next state; it is NaN.
 
     Args:
         mjcf: the model as XML text, the path of its file, or the folder in which ``mujoco.sysid.save_results`` wrote
             one identified model. Its pickle files are never read.
         dt: length of a step in seconds, a multiple of the model's timestep; the timestep by default.
         data: the transitions that the model was identified from, if they are known.
+        sites, axes: sites whose positions are part of the state, as in :class:`ctxval.systems.MuJoCo`.
     """
 
     _forces: Array | None = None  # of every step; see `changed`
 
-    def __init__(self, mjcf: str | Path, *, dt: Seconds | None = None, data: Transitions | None = None) -> None:
-        _, self._model = compile_mjcf(mjcf if is_mjcf_text(mjcf) else identified_in(Path(mjcf)))
-        timestep = float(self._model.opt.timestep)
+    def __init__(
+        self,
+        mjcf: str | Path,
+        *,
+        dt: Seconds | None = None,
+        data: Transitions | None = None,
+        sites: str | Sequence[str] = (),
+        axes: str = "xy",
+    ) -> None:
+        _, model = compile_mjcf(mjcf if is_mjcf_text(mjcf) else identified_in(Path(mjcf)))
+        timestep = float(model.opt.timestep)
         ratio = 1.0 if dt is None else dt / timestep
         self.substeps = round(ratio)
         if self.substeps < 1 or abs(ratio - self.substeps) > 1e-6 * max(1.0, ratio):
             raise InputError(f"dt must be a multiple of the model's timestep, {timestep:g} s, got {dt:g} s.")
-        self.data = data
-        if (na := self._model.na) > 0:
-            raise InputError(f"the model has {na} activations, which are no part of the state (qpos, qvel).")
+        self.data, self.sites, self.axes = data, sites, axes
+        self._simulate(model)
+
+    def _simulate(self, model: Any) -> None:
+        self._simulator = self._converging = Simulator(model, self.substeps, self.sites, self.axes)
+        if min(model.opt.iterations, 2 * model.opt.ls_iterations) < _CONVERGING:
+            converging = copy.copy(model)
+            converging.opt.iterations = max(model.opt.iterations, _CONVERGING)
+            converging.opt.ls_iterations = max(model.opt.ls_iterations, _CONVERGING // 2)
+            self._converging = Simulator(converging, self.substeps, self.sites, self.axes)
 
     @property
     def dt(self) -> float:
         """Length of a step, seconds."""
-        return float(self._model.opt.timestep) * self.substeps
+        return float(self.compiled.opt.timestep) * self.substeps
 
     @property
     def compiled(self) -> Any:
         """The compiled ``mujoco.MjModel``, which must not be changed: :meth:`changed` changes a copy."""
-        return self._model
+        return self._simulator.model
 
     def changed(self, change: Callable[[Any], None] | None = None, *, forces: Array | None = None) -> MuJoCo:
         """Return the model after a function has changed its compiled ``mujoco.MjModel``.
@@ -68,33 +85,29 @@ class MuJoCo:
         another = copy.copy(self)
         if change is not None:
             mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo need")
-            another._model = copy.copy(self._model)
-            change(another._model)
-            mujoco.mj_setConst(another._model, mujoco.MjData(another._model))
+            model = copy.copy(self.compiled)
+            change(model)
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+            another._simulate(model)
         if forces is not None:
             another._forces = forces
         return another
 
     def step(self, x: Array, u: Array) -> Array:
-        model, nq = self._model, self._model.nq
-        if (x.shape[-1], u.shape[-1]) != (nq + model.nv, model.nu):
-            got = f"{x.shape[-1]} states and {u.shape[-1]} inputs"
-            raise ShapeError(f"the model has {nq} qpos, {model.nv} qvel and {model.nu} inputs, got {got}.")
-        batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-        states, inputs = map(rows_of, paired(x, u))
-        reached = np.full(states.shape, np.nan)
-        mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo need")
-        data = mujoco.MjData(model)
+        self._simulator.require(x, u)
+        x, u = paired(x, u)
         with quiet():
-            for k in np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1)).tolist():
-                mujoco.mj_resetData(model, data)
-                data.qpos, data.qvel, data.ctrl = states[k, :nq], states[k, nq:], inputs[k]
-                if self._forces is not None:
-                    data.qfrc_applied = self._forces
-                mujoco.mj_step(model, data, self.substeps)
-                if not data.warning.number.any():
-                    reached[k] = np.concatenate([data.qpos, data.qvel])
-        return reached.reshape(*batch, -1)
+            return self._converging.advance(x, u, self.start(x))[0]
+
+    def start(self, x: Array) -> Array:
+        """Return the memory ``(..., k)`` of simulations that start in states ``(..., n)`` from the model's defaults."""
+        return self._simulator.start(x, self._forces)
+
+    def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
+        """Return the next states ``(..., n)`` of simulations and their memory ``(..., k)``."""
+        x, u = paired(x, u)
+        with quiet():
+            return self._simulator.advance(x, u, memory)[:2]
 
 
 def identified_in(path: Path) -> Path:

@@ -9,7 +9,7 @@ import numpy as np
 from ctxval._util.arrays import Array, as_floats
 from ctxval.core.controller import Controller, started
 from ctxval.core.task import Task
-from ctxval.core.trajectory import COMPLETE, Trajectory
+from ctxval.core.trajectory import COMPLETE, TERMINATED, Trajectory
 from ctxval.errors import InputError, ShapeError
 
 Advance = Callable[[Array], tuple[Array, str]]  # u -> (x_next, why the episode ended), empty if it continues
@@ -33,7 +33,7 @@ def run_episode(advance: Advance, controller: Controller, task: Task, inputs: in
         x, reason = advance(u) if np.isfinite(u).all() else (np.full_like(x, np.nan), "an input is not finite")
         states[t + 1] = x = as_floats("states of the system", x)
         if not np.isfinite(x).all():
-            reason = reason or "the state is not finite"
+            reason = reason or f"{TERMINATED}: the state is not finite"
         elif t + 1 == task.horizon:
             reason = ""
         if reason:

@@ -44,7 +44,8 @@ class FMU:
     Args:
         path: the ``.fmu`` file.
         states, inputs: names of the variables that make up the state, and of the inputs; all are real numbers.
-        start: the variable whose start value sets a state, by the name of the state; by default its own variable.
+        start: the variable whose start value sets a state, by the name of the state; by default its own variable. A
+            state that the FMU calculates (``initial="calculated"``) often needs one, such as ``{"T": "T_start"}``.
         parameters: values of other variables, set before the initialisation.
         step: the communication step size in seconds, of which a task's dt must be a whole multiple; by default the dt.
     """
@@ -81,12 +82,22 @@ class FMU:
         require_known("variable of the FMU", named, known)
         start = [self.start[name] for name in self.states]
         _references(known, start)
+        for what, variables in (
+            ("start", [name for name in start if name not in self.states]),
+            ("parameters", self.parameters),
+        ):
+            if fixed := [name for name in variables if not _has_start(known[name])]:
+                raise InputError(f"{what} must name variables with a start value, got {_told(known[fixed[0]])}.")
+        if read := [name for name in self.inputs if not _is_input(known[name])]:
+            raise InputError(f"inputs must name inputs or tunable parameters of the FMU, got {_told(known[read[0]])}.")
+        self._calculated = [i for i, name in enumerate(self.states) if not _has_start(known[name])]
+        self._candidates = [each.name for each in known.values() if each.causality == "parameter" and _has_start(each)]
         references = {"states": _references(known, self.states), "inputs": _references(known, self.inputs)}
         file = {"folder": self._unpacked, "name": self.path.name}
         self._setup = file | references | {"start": start, "parameters": self.parameters}
         try:
             with self._process() as process:
-                process.ask("begin", None, 0.0, 1)
+                process.ask("begin", [], 0.0, 1)
                 process.ask("free")
         except _CrashError as crash:
             raise InputError(f"{self.path.name}: {crash} when it was initialised.") from crash
@@ -104,13 +115,44 @@ class FMU:
             raise InputError(f"the task's dt must be a whole multiple of the step {self.step:g} s, got {task.dt:g} s.")
         substeps = round(ratio)
         with self._process() as process:
-            state = process.ask("begin", task.initial_state.tolist(), task.dt / substeps, substeps)
-            require_started(task, np.array(state))
+            self._start(process, task, task.dt / substeps, substeps)
             trajectory = run_episode(process.advance, controller, task, len(self.inputs))
             process.sound = trajectory.ended == COMPLETE
             with contextlib.suppress(_CrashError):  # the execution is over
                 process.ask("free")
             return trajectory
+
+    def _start(self, process: _Process, task: Task, step: float, substeps: int) -> None:
+        """Start an instance in the task's initial state.
+
+        A state that is calculated by the description of the FMU may have no start value, and many FMUs calculate it in
+        their first step only. So a very short step of another instance shows where such a state starts.
+        """
+        values: list[float | None] = task.initial_state.tolist()
+        shown = list[float]()
+        if self._calculated and len(values) == len(self.states):
+            try:
+                process.ask("begin", values, 1e-9 * step, 1)
+            except InputError:  # the FMU refuses start values that its description does not have
+                process.ask("free")
+                own = [i for i in self._calculated if self.start[self.states[i]] == self.states[i]]
+                values = [None if i in own else value for i, value in enumerate(values)]
+                process.ask("begin", values, 1e-9 * step, 1)
+            shown = process.ask("advance", [])[0] or []
+            process.ask("free")
+        state = process.ask("begin", values, step, substeps)
+        for i in self._calculated if shown else ():
+            state[i] = shown[i]
+        try:
+            require_started(task, np.array(state))
+        except InputError as error:
+            if not shown:
+                raise
+            names = ", ".join(self.states[i] for i in self._calculated)
+            advice = (
+                f"the FMU calculates {names}, and `start` names the parameters that set them: {self._candidates[:20]}"
+            )
+            raise InputError(f"{str(error).removesuffix('.')}; {advice}.") from error
 
     @contextlib.contextmanager
     def _process(self) -> Iterator[_Process]:
@@ -218,6 +260,20 @@ def _unpacked(path: Path) -> tuple[Any, str]:
         fmpy.extract(str(path), folder)
         stack.pop_all()
     return description, folder
+
+
+def _has_start(variable: Any) -> bool:
+    """Return whether the description of an FMU gives a variable a start value that may be set."""
+    return bool(variable.variability != "constant" and variable.initial in ("exact", "approx"))
+
+
+def _is_input(variable: Any) -> bool:
+    kinds = variable.causality, variable.variability
+    return kinds[0] == "input" or kinds == ("parameter", "tunable")
+
+
+def _told(variable: Any) -> str:
+    return f"{variable.name} (causality {variable.causality}, {variable.variability}, initial {variable.initial})"
 
 
 def _references(known: Mapping[str, Any], names: Sequence[str]) -> list[int]:

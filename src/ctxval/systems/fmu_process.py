@@ -49,8 +49,8 @@ class Unit:
         self.fmu: Any = None
         self.initialised = False
 
-    def begin(self, x: list[float] | None, step: float, substeps: int) -> list[float]:
-        """Start a simulation in a state, or in the FMU's own initial state; return the state in which it starts."""
+    def begin(self, x: list[float | None], step: float, substeps: int) -> list[float]:
+        """Start a simulation; start values that are None are the FMU's own. Return the state in which it starts."""
         from fmpy.simulation import instantiate_fmu
 
         self.steps, self.step, self.substeps = 0, step, substeps
@@ -59,10 +59,10 @@ class Unit:
         kind = "Float64" if self.is_fmi3 else "Real"
         self._set, self._get = (getattr(self.fmu, f"{act}{kind}") for act in ("set", "get"))
         # The campaign's process reports a wrong number of states.
-        if x is not None and len(x) == len(self.start):
-            what = f"the FMU does not let the start values of {', '.join(self.start)} be set"
+        if len(x) == len(self.start) and (chosen := [i for i, value in enumerate(x) if value is not None]):
+            what = f"the FMU does not let the start values of {', '.join(self.start[i] for i in chosen)} be set"
             with refused(what, input_is_wrong=True):
-                self._set(self.start_references, x)
+                self._set([self.start_references[i] for i in chosen], [x[i] for i in chosen])
         with refused(f"the FMU {self.name} cannot be initialised"):
             enumeration = "Int64" if hasattr(self.fmu, "setInt64") else "Integer"
             for variable, value in self.parameters:
@@ -88,7 +88,7 @@ class Unit:
                 ended = self.fmu.doStep(self.steps * self.step, self.step)
                 self.steps += 1
                 if ended is not None and ended[1]:
-                    return None, "the FMU terminated the simulation"
+                    return None, "terminated: the FMU ended the simulation"
             return self._state(), ""
         except Exception as error:
             return None, f"the FMU failed ({error})"

@@ -14,7 +14,7 @@ from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
 from ctxval.core.controller import Controller, Feedback, started
 from ctxval.core.labels import require_names
-from ctxval.core.model import Model, Step, as_model
+from ctxval.core.model import Model, Step, as_model, run_of
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -136,6 +136,7 @@ class Imperfect:
         if self.start.any():
             start = start + self.start * rng.standard_normal(start.shape)
         actuator, truth, memory = Actuator(self.delay, self.lag), start, None
+        of_model = run_of(self.model, start)
 
         def record(x: Array) -> Array:
             read = x + self.measurement * rng.standard_normal(x.shape) if self.measurement.any() else x
@@ -145,7 +146,7 @@ class Imperfect:
         def step(_: Array, u: Array) -> Array:
             nonlocal truth, memory
             u, memory = actuator.follow(np.array(u), memory)
-            truth = self.model.step(truth, u)
+            truth = of_model(truth, u)
             if self.process.any():
                 truth = truth + self.process * rng.standard_normal(truth.shape)
             return record(truth)

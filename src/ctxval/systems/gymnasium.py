@@ -12,12 +12,12 @@ import numpy as np
 
 from ctxval._util.arrays import Array, as_floats
 from ctxval._util.checked import Must, NonNegativeInt, Seconds, require
-from ctxval._util.mjcf import warning_of
+from ctxval._util.mjcf import instability, warning_of
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
-from ctxval.core.trajectory import Trajectory
+from ctxval.core.trajectory import TERMINATED, Trajectory
 from ctxval.errors import InputError, ShapeError
 from ctxval.systems.episode import require_one, require_started, run_episode
 
@@ -167,10 +167,13 @@ class Gymnasium:
         state = self._read(environment.unwrapped)
         counts = getattr(getattr(getattr(environment.unwrapped, "data", None), "warning", None), "number", None)
         if counts is not None and np.any(counts):
-            return np.full_like(state, np.nan), f"MuJoCo warned of {warning_of(counts)}"
+            name = warning_of(counts)
+            return np.full_like(state, np.nan), f"{instability(name)}MuJoCo warned of {name}"
         if self.ignore_termination or not (terminated or truncated):
             return state, ""
-        return state, f"the environment {'terminated' if terminated else 'truncated'} the episode"
+        if terminated:
+            return state, f"{TERMINATED}: the environment ended the episode"
+        return state, "the environment truncated the episode"  # a time limit says nothing about the system
 
     def __getstate__(self) -> dict[str, Any]:
         # Environments cannot be pickled; another process makes its own.

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, Mask, as_finite, require_shape
-from ctxval._util.checked import PositiveInt, require_known
-from ctxval._util.mjcf import compile_mjcf, warning_of
+from ctxval._util.arrays import Array, ArrayLike, as_finite, require_shape, rows_of
+from ctxval._util.checked import PositiveInt
+from ctxval._util.mjcf import Simulator, compile_mjcf, instability, warning_of
 from ctxval._util.registry import part
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
@@ -53,14 +53,8 @@ class MuJoCo:
     ) -> None:
         self._digest, self._model = compile_mjcf(mjcf)
         self.substeps, self.threads = substeps, threads
-        self.sites, self.axes = (sites,) if isinstance(sites, str) else tuple(sites), axes
-        if not axes or not set(axes) <= set("xyz"):
-            raise InputError(f"axes must be letters of 'xyz', got {axes!r}.")
-        known = [self._model.site(i).name for i in range(self._model.nsite)]
-        require_known("site", self.sites, known)
-        # The indices of the coordinates of sites in positions (nsite, 3).
-        rows = np.array([known.index(site) for site in self.sites], dtype=np.intp)
-        self._coordinates = np.ix_(rows, np.array(["xyz".index(axis) for axis in axes], dtype=np.intp))
+        self._simulator = Simulator(self._model, substeps, sites, axes, threads)
+        self.sites, self.axes = self._simulator.sites, axes
 
     @property
     def dt(self) -> float:
@@ -76,83 +70,42 @@ class MuJoCo:
         velocities = np.zeros(self._model.nv) if qvel is None else as_finite("qvel", qvel)
         require_shape("qvel", velocities, (self._model.nv,))
         batch = np.broadcast_shapes(positions.shape[:-1], velocities.shape[:-1])
-        simulations = _Batch(self._model, int(np.prod(batch)), 1)
-        simulations.qpos[:] = np.broadcast_to(positions, (*batch, self._model.nq)).reshape(-1, self._model.nq)
-        simulations.qvel[:] = np.broadcast_to(velocities, (*batch, self._model.nv)).reshape(-1, self._model.nv)
-        simulations.locate()
-        return self._observed(simulations).reshape(*batch, -1)
+        parts = [np.broadcast_to(part, (*batch, part.shape[-1])) for part in (positions, velocities)]
+        return self._simulator.observed(np.concatenate(parts, axis=-1))
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         if not np.isclose(task.dt, self.dt, rtol=1e-9, atol=0):
             wanted = f"{self._model.opt.timestep:g} s x {self.substeps} = {self.dt:g} s"
             raise InputError(f"the task's dt must be the model's timestep times substeps, {wanted}, got {task.dt:g} s.")
-        from mujoco import mjtStage
-
-        simulations, steps, failure = self._started(task), 0, ""
-        stage = int(mjtStage.mjSTAGE_POS if self.sites else mjtStage.mjSTAGE_NONE)  # whether sites are located
-        ctrl, healthy = simulations.ctrl, np.ones(len(simulations.qpos), dtype=bool)
-
-        def mark(failed: Mask, reason: str) -> None:
-            nonlocal failure
-            if (failed & healthy).any():
-                failure = failure or f"{reason} at step {steps}"
-                healthy[failed] = False
+        self._require_start(task.initial_state)
+        memory, steps, failure = self._simulator.start(task.initial_state), 0, ""
 
         def step(x: Array, u: Array) -> Array:
-            nonlocal steps
-            if u.shape[-1] != ctrl.shape[1]:
-                raise ShapeError(f"the controller must return the model's {ctrl.shape[1]} inputs, got {u.shape[-1]}.")
-            inputs = u.reshape(ctrl.shape)
+            nonlocal memory, steps, failure
+            if u.shape[-1] != self._model.nu:
+                raise ShapeError(f"the controller must return the model's {self._model.nu} inputs, got {u.shape[-1]}.")
             steps += 1
-            mark(np.asarray(~np.isfinite(inputs).all(axis=1)), "an input is not finite")
-            ctrl[healthy] = inputs[healthy]
-            ids = None if healthy.all() else np.flatnonzero(healthy)
-            simulations.batch.step(ids, self.substeps, stage)
-            warned: Mask = np.asarray(simulations.batch.warning[:, :, 1] > 0)
-            if warned.any():
-                mark(np.asarray(warned.any(axis=1)), f"MuJoCo warned of {warning_of(warned.any(axis=0))}")
-            states = self._observed(simulations)
-            states[~healthy] = np.nan
-            return states.reshape(x.shape)
+            if not (failure or (np.isfinite(u).all(axis=-1) | np.isnan(x).any(axis=-1)).all()):
+                failure = f"an input is not finite at step {steps}"
+            x, memory, warned = self._simulator.advance(x, u, memory)
+            if warned.any() and not failure:
+                name = warning_of(warned.reshape(-1, warned.shape[-1]).any(axis=0))
+                failure = f"{instability(name)}MuJoCo warned of {name} at step {steps}"
+            return x
 
         trajectory = rollout(step, controller, task)
         return replace(trajectory, ended=failure or trajectory.ended)
 
-    def _started(self, task: Task) -> _Batch:
-        nq, nv, sites = self._model.nq, self._model.nv, self._coordinates[0].size * self._coordinates[1].size
-        states = task.initial_state.reshape(-1, task.initial_state.shape[-1])
-        if states.shape[1] != nq + nv + sites:
+    def _require_start(self, x: Array) -> None:
+        nq, nv = self._model.nq, self._model.nv
+        sites = self._simulator.states - nq - nv
+        if x.shape[-1] != nq + nv + sites:
             wanted = f"{nq + nv + sites} states, {nq} qpos, {nv} qvel and {sites} coordinates of sites"
-            raise ShapeError(f"the task must have {wanted}, got {states.shape[1]}.")
-        simulations = _Batch(self._model, len(states), self.threads)
-        simulations.qpos[:], simulations.qvel[:] = states[:, :nq], states[:, nq : nq + nv]
+            raise ShapeError(f"the task must have {wanted}, got {x.shape[-1]}.")
         if sites:
-            simulations.locate()
-            given, actual = states[:, nq + nv :], self._observed(simulations)[:, nq + nv :]
+            given, actual = (rows_of(states)[:, nq + nv :] for states in (x, self._simulator.observed(x)))
             misses = np.abs(given - actual).max(axis=1)
             if misses.max() > 1e-6:  # metres
                 wanted, got = (part[misses.argmax()].tolist() for part in (actual, given))
                 sentence = f"the initial state must end with the sites' positions at its qpos, {wanted}, got {got}"
                 raise InputError(f"{sentence}; state(qpos, qvel) returns the whole state.")
-        return simulations
-
-    def _observed(self, simulations: _Batch) -> Array:
-        sites, axes = self._coordinates
-        positions = simulations.site_positions[:, sites, axes]
-        return np.concatenate([simulations.qpos, simulations.qvel, positions.reshape(len(positions), -1)], axis=1)
-
-
-class _Batch:
-    """Simulations of one model: qpos ``(N, nq)``, qvel ``(N, nv)``, ctrl ``(N, nu)``, sites ``(N, nsite, 3)``."""
-
-    def __init__(self, model: Any, count: int, threads: int) -> None:
-        from mujoco.batch import Batch
-
-        self.batch = Batch(model, count, threads)
-        self.qpos, self.qvel, self.ctrl = (self.batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
-        self.site_positions: Array = self.batch.bind("site_xpos")
-
-    def locate(self) -> None:
-        from mujoco import mjtStage
-
-        self.batch.forward(stage=int(mjtStage.mjSTAGE_POS))

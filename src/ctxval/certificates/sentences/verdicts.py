@@ -41,6 +41,10 @@ def falsified(
     worst: Trial, trials: Sequence[Trial], tau: float, quantities: Quantities, bets: Bets | None, confidence: float
 ) -> str:
     """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it."""
+    if worst.ended_alone is not None:
+        what = f"S ended after {worst.ended_alone:.3g} s ({quoted(worst.failure or '')}) and M did not"
+        where = quantities.task(worst).removeprefix("task ")
+        return f"in trial {worst.number}, {what}, in the task {where}: this exceeds every threshold."
     distance, limit = distinguishable(worst.least, tau)
     if worst.distance is None:
         return (

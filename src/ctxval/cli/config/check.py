@@ -20,6 +20,7 @@ from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of, names_of
 from ctxval.core.plan import Plan, require_repeatable
 from ctxval.core.soundness import MISSED, SATURATED, goal_misses
+from ctxval.core.trajectory import COMPLETE
 from ctxval.errors import ConformanceError, CtxvalError
 from ctxval.learning.extended import with_states_of_model
 from ctxval.specs import Specification
@@ -58,6 +59,7 @@ def check_experiment(
             "names": _names(experiment, counts),
             "system": _system(validation, plans[0], counts),
             "model": _model(validation, of_model),
+            "model against itself": _itself(validation, plans),
             "batches": _batches(validation, plans),
             "distance": _distance(experiment, plans),
             "specification": _specification(spec, plans),
@@ -180,6 +182,29 @@ def _model(validation: Validation, counts: Mapping[str, int]) -> Findings:
     except ConformanceError:
         check_model(validation.model, **counts, tolerance=1e-5)
         yield "noted", "its results for batches and single states agree only to single precision"
+
+
+def _itself(validation: Validation, plans: Sequence[Plan]) -> Findings:
+    """Run M in the place of S with the same controllers, and state d(M, M): no smaller distance means anything."""
+    on_model, largest, apart = validation.on_model(validation.distance), 0.0, 0.0
+    for plan in plans[:3]:
+        again = on_model.system.execute(plan.controller, plan.task)
+        again = again.first(min(int(again.lengths), plan.model_trajectory.horizon))
+        largest = max(largest, validation.measure(plan, again))
+        own = plan.model_trajectory.states[: again.horizon + 1]
+        apart = max(apart, float((np.abs(again.states - own) / np.maximum(1.0, np.abs(own).max(axis=0))).max()))
+    text = f"the distance between M and M in the place of S is {largest:.3g} in {len(plans[:3])} tasks"
+    if apart <= 1e-9:
+        yield "ok", text
+    else:
+        yield (
+            "noted",
+            f"{text}: two runs of M differ by up to {apart:.2g}, so M or its controller is random or remembers runs",
+        )
+    if early := [plan for plan in plans if plan.model_trajectory.ended != COMPLETE]:
+        where = task_text(validation.space.describe_point(early[0].parameters.points))
+        end = f"after {early[0].model_trajectory.times[-1]:.3g} s"
+        yield "noted", f"its closed loop ends early in {len(early)} of {len(plans)} tasks, such as {end} at {where}"
 
 
 def _batches(validation: Validation, plans: Sequence[Plan]) -> Findings:
