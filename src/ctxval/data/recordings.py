@@ -128,6 +128,7 @@ def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], not
         clock = replace(clock, period=mapping.dt)
     paths = [field.path for field in mapping.fields.values()]
     signals = log.signals([*paths, *([condition[0]] if condition else [])], clock)
+    notes += log.remarks
     channels: list[Channel] = []
     for name, field in mapping.fields.items():
         signal = signals[field.path]
