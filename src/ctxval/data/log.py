@@ -132,6 +132,10 @@ class Table(Log):
     def fields(self) -> tuple[str, ...]:
         return tuple(self.names)
 
+    def has(self, field: str) -> bool:
+        """Return whether a column is meant by a field, with or without its unit."""
+        return column_of(self.source, self.names, field) is not None
+
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
         require_distinct(self.source, self.names)
         find = partial(column_of, self.source, self.names)

@@ -21,6 +21,7 @@ from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.files import MOST_BYTES, Archive, read_bytes, read_json, require_regular_file
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.tables import CsvTable
+from ctxval.data.joined import joined_topics, read_ulog
 from ctxval.data.log import Log, MemoryTable, Table, leaves, reading
 from ctxval.data.matlab import read_mat
 from ctxval.data.messages import BagLog, McapLog
@@ -172,6 +173,7 @@ READERS: dict[str, Callable[[Path], list[Log]]] = {
     **dict.fromkeys((".csv", ".txt", ".tsv", ".dat", ".lvm"), read_csv),
     ".npz": read_npz,
     ".mat": read_mat,
+    ".ulg": read_ulog,
     ".parquet": read_parquet,
     ".mcap": lambda path: [McapLog(path)],
     ".db3": lambda path: [BagLog(path)],
@@ -189,12 +191,12 @@ def read_logs(paths: Sequence[str | Path]) -> list[Log]:
     """Return the logs in files and folders.
 
     A folder is a bag of ROS 2 if it has a file ``metadata.yaml``, a LeRobot data set if it has ``meta/info.json``, and
-    otherwise all logs in it are read, in the order of their names.
+    otherwise all logs in it are read, in the order of their names. Files with the topics of one recording are one log.
     """
     logs = [log for path in paths for log in _logs(Path(path))]
     if not logs:
         raise InputError("there is no log: give at least one file or folder.")
-    return logs
+    return joined_topics(logs)
 
 
 def is_log(path: Path) -> bool:
