@@ -240,7 +240,7 @@ def _layout(head: list[str], plain: bool) -> _Layout:
     if not usual[separator][1] and not stated:
         separator = ","
     width, table = usual[separator][0], [row for row in rows[separator] if any(cell.strip() for cell in row[1])]
-    header, units, end = _header(table, width)
+    header, units, end = _header(table, width, plain)
     names = [unguarded(name).strip() for name in header]
     if start and names[-1:] == ["Comment"] and width == len(names) - 1:
         names.pop()  # the rows of LabVIEW end before it
@@ -251,24 +251,25 @@ def _layout(head: list[str], plain: bool) -> _Layout:
     return _Layout(separator, start + end, tuple(names), tuple(filter(None, (header, units))))
 
 
-def _header(rows: Sequence[_Row], width: int) -> tuple[list[str], list[str], int]:
+def _header(rows: Sequence[_Row], width: int, plain: bool) -> tuple[list[str], list[str], int]:
     """Return the cells of the header and of the row of units, and the number of the line in which these end."""
     of_data = (k for k, (_, cells, comment) in enumerate(rows) if not comment and len(cells) == width)
     first = next((k for k in of_data if _has_numbers(rows[k][1])), None)
     above = [k for k in range(len(rows) if first is None else first) if len(rows[k][1]) == width]
-    plain = [k for k in above if not rows[k][2]]
-    # A header is the first row of the width of the table that has no number; numpy and rostopic write it as a comment.
-    texts = [k for k in plain or above if not any(_NUMBER.fullmatch(cell.strip()) for cell in rows[k][1])]
     whole = [k for k, row in enumerate(rows) if not row[2]]
+    rather = [k for k in above if not rows[k][2]]
+    # A header is the first row of the width of the table that has no number; numpy and rostopic write it as a comment.
+    texts = [k for k in rather or above if not any(_NUMBER.fullmatch(cell.strip()) for cell in rows[k][1])]
     if first is None:
-        texts = plain or []
-    if not (number := (texts or plain or whole)[:1]):
+        texts = rather
+    if not (number := (texts or rather or whole)[:1]):
         return [], [], 0
     header = rows[number[0]]
-    for row in rows[number[0] + 1 : first] if first is not None else ():
+    for row in rows[number[0] + 1 : first] if first is not None and not plain else ():
         stated = [cell.strip().strip("[]()").strip() for cell in row[1]]
         texts_of = [cell for cell in stated if cell not in ("", "-", "1")]
-        if len(row[1]) == width and texts_of and 2 * sum(map(is_unit, texts_of)) >= len(texts_of):
+        units = len(row[1]) == width and texts_of and not any(map(_NUMBER.fullmatch, texts_of))
+        if units and 2 * sum(map(is_unit, texts_of)) >= len(texts_of):
             return header[1], row[1], row[0]
     return header[1], [], header[0]
 

@@ -171,10 +171,10 @@ class Table(Log):
         rows = np.column_stack([times, values])
         empty: Mask = np.isnan(rows).all(axis=1)
         same = (rows[1:] == rows[:-1]) | (np.isnan(rows[1:]) & np.isnan(rows[:-1]))
-        twice: Mask = np.append(False, same.all(axis=1)) & ~empty
-        for rows_of, what in ((empty, "without a number left out"), (twice, "written twice count once")):
+        twice: Mask = np.asarray(np.append(False, same.all(axis=1)) & ~empty)
+        for rows_of, what in ((empty, "no number in it"), (twice, "a copy of the one before")):
             count = int(rows_of.sum())
-            if count and (text := f"{self.source}: {counted(count, self.word)} {what}") not in self.remarks:
+            if count and (text := f"{self.source}: {counted(count, self.word)} left out ({what})") not in self.remarks:
                 self.remarks.append(text)
         return ~(empty | twice)
 
