@@ -164,9 +164,9 @@ class CsvTable:
     def number(self, line: int, name: str, cell: str) -> float:
         mark = "," if "," in cell else "." if "." in cell else ""
         try:
-            if "_" in cell or (self._layout.separator == "," and _THOUSANDS.fullmatch(cell.strip())):
+            if "_" in cell or (mark == self._layout.separator and _THOUSANDS.fullmatch(cell.strip())):
                 raise ValueError
-            value = float(cell.replace(",", "."))
+            value = float(cell.replace(",", ".") if mark == "," else cell)
         except ValueError:
             shown = f"got {cell[:60]!r}" if cell.strip() else "and the cell is empty"
             raise InputError(f"{self.path}, line {line}: {name} must be a number, {shown}.") from None

@@ -169,7 +169,7 @@ class Table(Log):
     def _kept(self, times: Array, values: Array) -> Mask:
         """Return which rows count: rows without any number separate sessions, and a logger may write a row twice."""
         rows = np.column_stack([times, values])
-        empty: Mask = np.isnan(rows).all(axis=1)
+        empty: Mask = np.asarray(np.isnan(rows).all(axis=1))
         same = (rows[1:] == rows[:-1]) | (np.isnan(rows[1:]) & np.isnan(rows[:-1]))
         twice: Mask = np.asarray(np.append(False, same.all(axis=1)) & ~empty)
         for rows_of, what in ((empty, "no number in it"), (twice, "a copy of the one before")):
