@@ -64,6 +64,15 @@ def test_a_log_of_px4_is_read_at_the_rates_of_its_topics(tmp_path: Path) -> None
     np.testing.assert_allclose(run.trajectory.inputs[:, 0], held, atol=1e-3)
 
 
+def test_damaged_parts_of_a_log_of_px4_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pyulog")
+    path = ulog(tmp_path / "a.ulg", {"rates": ("xyz", FAST, RATES), "controls": ("control", SLOW, SLOW[:, None])})
+    content = path.read_bytes()
+    path.write_bytes(content[:-25] + struct.pack("<HcH", 22, b"D", 999) + content[-20:])  # a topic that is not there
+    assert [note for note in read_recordings([path], MAPPING).notes if "is damaged: some" in note]
+    assert capsys.readouterr().out == ""
+
+
 @pytest.mark.parametrize("content", [b"", b"ULog", b"ULog\x01\x12\x35\x01" + bytes(8)])
 def test_a_damaged_log_of_px4_is_refused(content: bytes, tmp_path: Path) -> None:
     pytest.importorskip("pyulog")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
 from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
@@ -24,7 +26,7 @@ class JoinedLog(Log):
 
     def __init__(self, source: str, tables: Mapping[str, Table], unit: str = "") -> None:
         self.source, self._tables, self._unit = source, dict(tables), unit
-        self.about: list[str] = []  #: how the tables became one log
+        self.about: list[str] = []  #: how the tables became one log, and what is missing in it
         times = {topic: (time_column(source, table.names) or ("", ""))[0] for topic, table in tables.items()}
         of_topics = {topic: [n for n in table.names if n != times[topic]] for topic, table in tables.items()}
         counted = Counter(name for names in of_topics.values() for name in names)
@@ -67,8 +69,9 @@ class JoinedLog(Log):
 def read_ulog(path: Path) -> list[Log]:
     """Return the recording in a ULog file of PX4, whose times are in microseconds; needs pyulog."""
     library = require_extra("pyulog", "logs", "ULog files need")
-    with reading(path, "ULog"), open_regular(path) as file:
-        topics = library.ULog(file).data_list
+    with reading(path, "ULog"), open_regular(path) as file, redirect_stdout(io.StringIO()):  # pyulog prints warnings
+        content = library.ULog(file)
+        topics = content.data_list
         names = Counter(topic.name for topic in topics)
         tables = {}
         for topic in topics:
@@ -77,7 +80,9 @@ def read_ulog(path: Path) -> list[Log]:
             tables[name] = MemoryTable(f"{path}, {name}", columns)
     if not tables:
         raise InputError(f"{path} has no message.")
-    return [JoinedLog(str(path), tables, "us")]
+    log = JoinedLog(str(path), tables, "us")
+    log.about = [f"{path} is damaged: some of its messages are left out"] if content.file_corruption else []
+    return [log]
 
 
 def joined_topics(logs: Sequence[Log]) -> list[Log]:
