@@ -68,7 +68,7 @@ def test_damaged_parts_of_a_log_of_px4_are_said(tmp_path: Path, capsys: pytest.C
     pytest.importorskip("pyulog")
     path = ulog(tmp_path / "a.ulg", {"rates": ("xyz", FAST, RATES), "controls": ("control", SLOW, SLOW[:, None])})
     content = path.read_bytes()
-    path.write_bytes(content[:-25] + struct.pack("<HcH", 22, b"D", 999) + content[-20:])  # a topic that is not there
+    path.write_bytes(content[:-17] + struct.pack("<HcH", 14, b"D", 999) + content[-12:])  # a topic that is not there
     assert [note for note in read_recordings([path], MAPPING).notes if "is damaged: some" in note]
     assert capsys.readouterr().out == ""
 
