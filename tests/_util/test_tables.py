@@ -133,6 +133,31 @@ def test_a_table_of_tasks_keeps_every_row(tmp_path: Path) -> None:
     assert len([*CsvTable(path, plain=True).rows()]) == 6
 
 
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("t,x\n" + "1" * 200_000 + ",2\n", "cannot be read as CSV: field larger than field limit"),
+        ("t,x\n" + "1" * 2**21, "a row of more than 1048576 characters"),
+        ('sep="\nt,x\n0,"1"\n1,2\n', ""),
+        (b"t,x\n\x810,1\n", "cannot be read as CSV"),
+        ("t,x\n0,\0\n", "NUL bytes"),
+    ],
+)
+def test_texts_that_are_no_table_are_refused_by_name(content: str | bytes, sentence: str, tmp_path: Path) -> None:
+    path = written(tmp_path / "run.csv", content)
+    with pytest.raises(InputError) as caught:
+        Trajectory.from_csv(path)
+    assert "run.csv" in str(caught.value)
+    assert sentence in str(caught.value)
+
+
+def test_a_wide_table_is_read(tmp_path: Path) -> None:
+    names = ["t", *(f"field{k}" for k in range(9000))]
+    rows = [",".join(names), *(",".join([str(k), *["0.5"] * 9000]) for k in range(40))]
+    columns = CsvTable(written(tmp_path / "run.csv", "\n".join(rows))).columns(["t", "field8999"])
+    np.testing.assert_array_equal(columns["t"], range(40))
+
+
 @settings(deadline=None, max_examples=100)
 @given(st.binary(max_size=300))
 def test_any_bytes_are_read_or_refused_with_a_sentence(

@@ -31,7 +31,7 @@ from ctxval._util.texts import unguarded
 from ctxval.errors import InputError
 
 MOST_ROW = 2**20  # largest number of characters in a row
-_HEAD = 80  # number of lines in which the header is looked for
+_HEAD = 80  # number of lines in which the header is looked for, if they have less than MOST_ROW characters
 
 _SEPARATORS = ("\t", ";", ",", "|", " ")  # the first of those that split most rows alike; a blank stands for several
 _MARKS = (
@@ -79,7 +79,7 @@ class CsvTable:
         self._marks: dict[str, int] = {}
         self.remarks: list[str] = []  #: what was left out, one sentence each, after the rows were read
         with self._lines() as lines:
-            self._layout = _layout(list(itertools.islice(lines, _HEAD)), plain)
+            self._layout = _layout(list(_first(lines)), plain)
         self.names = self._layout.names
         require_distinct(str(path), self.names)
 
@@ -227,12 +227,20 @@ class _Lines(Iterator[str]):
 _Row = tuple[int, list[str], bool]  # the number of its last line, its cells, and whether it is a comment
 
 
+def _first(lines: _Lines) -> Iterator[str]:
+    """Yield the first lines; the first rows of a wide table are fewer."""
+    for line in itertools.islice(lines, _HEAD):
+        yield line
+        if lines.in_row > MOST_ROW // 2:
+            return
+
+
 def _layout(head: list[str], plain: bool) -> _Layout:
     """Return where the table is, from the first lines of a file."""
     start = 0
     if not plain:  # files of LabVIEW
         start = max((k + 1 for k, line in enumerate(head) if line.startswith("***End_of_Header***")), default=0)
-    stated = re.match(r'\s*"?sep=(.)"?\s*$', head[start], re.IGNORECASE) if head[start:] else None
+    stated = re.match(r'\s*"?sep=([;,|:\t ])"?\s*$', head[start], re.IGNORECASE) if head[start:] else None
     start += stated is not None
     rows = {mark: _split(head[start:], mark, plain) for mark in ([stated[1]] if stated else _SEPARATORS)}
     usual = {mark: _usual_width(of) for mark, of in rows.items()}
