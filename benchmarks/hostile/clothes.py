@@ -24,6 +24,7 @@ from hostile.values import Rng, pick
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
+import rig_dialects
 import rig_logs
 from ctxval import Trajectory
 
@@ -53,6 +54,7 @@ class Table:
         quoted, spaced: whether cells are quoted, or padded with blanks.
         kind: the suffix of the file.
         tolerance: relative difference of answers that rounding explains.
+        dialect: the name of a dialect in which a text file is written, if any.
         worn: the garments.
         extra: a hook for the writer of one format.
     """
@@ -65,6 +67,7 @@ class Table:
     quoted: bool = False
     spaced: bool = False
     kind: str = ".csv"
+    dialect: str = ""
     tolerance: float = 1e-6
     worn: list[str] = field(default_factory=list)
 
@@ -209,9 +212,15 @@ def _again(rng: Rng, table: Table) -> None:
     table.tolerance = 1.0
 
 
+def _dialect(rng: Rng, table: Table) -> None:
+    table.dialect = str(pick(rng, tuple(rig_dialects.DIALECTS)))
+    table.tolerance = 1.0 if table.dialect == "rows twice" else max(table.tolerance, 1e-3)  # clock times are rounded
+
+
 GARMENTS: tuple[Callable[[Rng, Table], None], ...] = (
     *(_permuted, _permuted, _more, _labelled, _in_units, _in_units, _other_times, _other_times, _epoch, _repeated),
     *(_repeated, _marked, _episodes, _semicolons, _decimal_commas, _text, _capitals, _renamed, _single, _again),
+    *[_dialect] * 4,
 )
 SUFFIXES = (".csv", ".csv", ".csv", ".npz", ".mat", ".mat73", ".parquet")
 QUICK = (*[".csv"] * 24, ".npz", ".npz", *SUFFIXES[4:])
@@ -239,7 +248,11 @@ def write(rng: Rng, table: Table, folder: Path, stem: str) -> Path:
     names = [name for name, _ in table.columns]
     arrays = {name: np.asarray(values) for name, values in table.columns}
     if table.kind == ".csv":
-        path.write_bytes(table.head + _csv(table).encode())
+        if table.dialect and names[0] == "t" and not (table.quoted or table.spaced):
+            path, content = _in_dialect(table, path)
+            path.write_bytes(content)
+        else:
+            path.write_bytes(table.head + _csv(table).encode())
     elif table.kind == ".npz":
         np.savez(path, **arrays)
     elif table.kind == ".parquet":
@@ -273,11 +286,23 @@ def _matlab(name: str) -> str:
     return "".join(c if c.isalnum() else "_" for c in name).strip("_")
 
 
+def _in_dialect(table: Table, path: Path) -> tuple[Path, bytes]:
+    """Return where a table is written, and in which bytes; blanks that separate columns leave no empty cell."""
+    ending, written = rig_dialects.DIALECTS[table.dialect]
+    empty = "nan" if " " in table.dialect else ""
+    content = written([[cell or empty for cell in row] for row in _cells(table)])
+    return path.with_suffix(ending), content if isinstance(content, bytes) else content.encode()
+
+
+def _cells(table: Table) -> list[list[str]]:
+    rows = zip(*(values for _, values in table.columns), strict=True)
+    cells = [["" if math.isnan(value) else repr(float(value)) for value in row] for row in rows]
+    return [[name for name, _ in table.columns], *cells]
+
+
 def _csv(table: Table) -> str:
-    cells = [[name for name, _ in table.columns]]
-    for row in zip(*(values for _, values in table.columns), strict=True):
-        texts = ["" if math.isnan(value) else repr(float(value)) for value in row]
-        cells.append([text.replace(".", table.decimal) for text in texts])
+    names, *rows = _cells(table)
+    cells = [names, *([text.replace(".", table.decimal) for text in row] for row in rows)]
     if table.quoted:
         cells = [[f'"{cell}"' for cell in row] for row in cells]
     blank = " " if table.spaced else ""

@@ -14,7 +14,6 @@ from hypothesis.extra.numpy import arrays
 from ctxval import Trajectory
 from ctxval._util.arrays import held_means
 from ctxval._util.columns import (
-    CsvTable,
     column_of,
     conversion,
     in_seconds,
@@ -23,6 +22,7 @@ from ctxval._util.columns import (
     time_column,
     unit_advice,
 )
+from ctxval._util.tables import CsvTable
 from ctxval.data import LogMapping, read_recordings
 from ctxval.errors import InputError
 

@@ -369,7 +369,7 @@ def with_cell(line: int, column: int, text: str) -> Any:
             "if the times are in ms, convert them to s, name their column t [ms]",
         ),
         (with_cell(5, 1, "-999"), "position is -999 at 0.3 s, far from all other values, which stands for a missing"),
-        (with_cell(7, 1, "1,5"), "line 7: position [m] must be a number, got '1,5'"),
+        (with_cell(7, 1, "1,5"), "decimal commas (line 7) and points (line 2)"),
         (without(0), "must have the columns t, position [m], speed [m/s], force [N]"),
         (lambda rows: rows[:15], "must have 21 times, 20 steps of 0.1 s, got 14 with steps of 0.1 s."),
         (lambda rows: rows[:1], "must have a header and at least two rows"),

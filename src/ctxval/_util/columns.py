@@ -1,23 +1,16 @@
-"""Units, columns and times of tables, what stands for a missing value in them, and the reader of CSV files."""
+"""Units, columns and times of tables, and what stands for a missing value in them."""
 
 from __future__ import annotations
 
-import csv
-import io
-import itertools
 import math
 import re
-from array import array
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.files import MOST_BYTES, open_regular
-from ctxval._util.refusals import reworded
-from ctxval._util.texts import enumerated, unguarded
+from ctxval._util.texts import enumerated
 from ctxval.errors import InputError
 
 # Units. Angles have a dimension of their own here: ``pint`` converts 1 Hz to 1 rad/s, and degrees to numbers.
@@ -70,12 +63,22 @@ def named_unit(column: str) -> tuple[str, str, bool]:
     """Return the name and the unit of a column, and whether the unit is weak: ``x_m`` may be a measured x."""
     if len(column) > 200:
         return column, "", False
+    if unit := CLOCKS.get(column.strip().casefold()):
+        return column.strip(), unit, False
     if (bracketed := _BRACKETS.fullmatch(column)) is not None:
         return bracketed[1], (bracketed[2] or bracketed[3] or "").strip(), False
     if (ended := _SUFFIX.fullmatch(column)) is None:
         return column.strip(), "", False
     rate = {"s": "/s", "s2": "/s^2"}.get(ended[3] or "", "")
     return ended[1], ended[2] + rate, not rate and ended[2] in ("m", "s", "N", "V", "A")
+
+
+def is_unit(text: str) -> bool:
+    """Return whether a text is a usual unit, also one that is not converted."""
+    return text.strip().casefold() in _NOT_CONVERTED.split() or _parsed(text) is not None
+
+
+_NOT_CONVERTED = "% °c degc c k °f f pa hpa kpa mpa bar mbar psi l/min count counts ticks lsb ohm"
 
 
 def _parsed(unit: str) -> tuple[float, Powers] | None:
@@ -108,6 +111,15 @@ def _plain(unit: str) -> str:
 
 TIMES = ("t", "time", "times", "timestamp")
 """Names of columns of times, the first of which is taken: a state may be called ``time`` too."""
+
+CLOCKS = {
+    **dict.fromkeys(("millis", "milliseconds", "msec", "msecs"), "ms"),
+    **dict.fromkeys(("micros", "microseconds", "usec", "usecs"), "us"),
+    **dict.fromkeys(("seconds", "secs", "sec", "x_value"), "s"),
+    **dict.fromkeys(("elapsed", "zeit", "uhrzeit", "zeitstempel", "temps", "tiempo", "tempo"), ""),
+    **dict.fromkeys(("datetime", "date_time", "time_stamp", "ts"), ""),
+}
+"""Other names of columns of times, with the unit that each states; they are looked for after the usual ones."""
 
 EPISODES = tuple(f"{name}{ending}" for name in ("episode", "run", "trial") for ending in ("", "_index", "_id"))
 """Names of columns that number the recordings in one table."""
@@ -143,7 +155,7 @@ def column_of(source: str, names: Sequence[str], field: str) -> tuple[str, str] 
 def time_column(source: str, names: Sequence[str]) -> tuple[str, str] | None:
     """Return the column of the times and its unit, empty if it states none; None if there is no such column."""
     plain = {name: named_unit(name)[0] for name in names}
-    for time in TIMES:
+    for time in (*TIMES, *CLOCKS):
         matching = [name for name, bare in plain.items() if time in (bare, bare.casefold() if time != "t" else "")]
         if time in matching or len(matching) == 1:
             column = time if time in matching else matching[0]
@@ -204,112 +216,3 @@ def sentinels(values: Array, factor: float = 1.0) -> list[float]:
 def _all_nines(value: float) -> bool:
     """Return whether all digits are nines, also if the number was rounded to 32 bits or converted to another unit."""
     return abs(value) >= 99 and any(set(f"{abs(value):.{digits}g}".replace(".", "")) == {"9"} for digits in (7, 15))
-
-
-# CSV files. Columns are separated by commas, semicolons or tabs. With the latter, numbers may have decimal commas.
-
-MOST_ROW = 2**20  # largest number of characters in a row
-
-
-class CsvTable:
-    """The cells of a CSV file of at most so many bytes, and the names of its columns, empty ones where it has none."""
-
-    def __init__(self, path: str | Path, most: int = MOST_BYTES) -> None:
-        self.path, self._most, self._separator = path, most, ","
-        self._marks: dict[str, int] = {}
-        first = next(self._cells(), (0, list[str]()))[1]
-        self.names = tuple(unguarded(name).strip() for name in first)
-        require_distinct(str(path), self.names)
-
-    def rows(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield the rows below the header that are not blank, with their line numbers; the last may be shorter."""
-        width, short = len(self.names), ""
-        for line, row in itertools.islice(self._cells(), 1, None):
-            if len(row) != width and not short:
-                short = f"{self.path}, line {line}: the row must have {width} cells, as the header has, got {len(row)}."
-                if len(row) < width:
-                    yield line, row + [""] * (width - len(row))
-                    continue
-                if self._separator == ",":
-                    short += " If commas are decimal commas, semicolons must separate the columns."
-            if short:
-                raise InputError(short)
-            yield line, row
-
-    def columns(
-        self, names: Sequence[str], *, missing: Sequence[str] = (), last: Sequence[str] = (), most: int | None = None
-    ) -> dict[str, Array]:
-        places = {name: place for place, name in enumerate(self.names)}
-        columns = {name: array("d") for name in names}
-        wrong: InputError | None = None
-        for count, (line, row) in enumerate(self.rows(), 1):
-            if wrong is not None:
-                raise wrong
-            if most is not None and count > most:
-                raise InputError(f"{self.path} must have {most} rows below its header, and has more.")
-            if 8 * len(names) * count > MOST_BYTES:
-                raise InputError(f"{self.path} has too many numbers: {MOST_BYTES} bytes may be read.")
-            for name, numbers in columns.items():
-                cell = row[places[name]]
-                try:
-                    empty = name in missing and cell.strip().lower() in ("", "nan", "na", "null", "none", "-")
-                    numbers.append(math.nan if empty else self.number(line, name, cell))
-                except InputError as error:
-                    if name not in last:
-                        raise
-                    wrong = wrong or error
-                    numbers.append(math.nan)
-        return {name: np.array(numbers) for name, numbers in columns.items()}
-
-    def texts(self, name: str) -> Array:
-        place = self.names.index(name)
-        return np.array([row[place].strip() for _, row in self.rows()])
-
-    def number(self, line: int, name: str, cell: str) -> float:
-        text = cell
-        if self._separator != ",":
-            mark = "," if "," in cell else "." if "." in cell else ""
-            if mark:
-                self._marks.setdefault(mark, line)
-            if len(self._marks) > 1:
-                commas, points = f"commas (line {self._marks[',']})", f"points (line {self._marks['.']})"
-                raise InputError(f"{self.path} has decimal {commas} and {points} in numbers: use one mark.")
-            text = cell.replace(",", ".")
-        try:
-            if "_" in text:
-                raise ValueError
-            return float(text)
-        except ValueError:
-            shown = f"got {cell[:60]!r}" if cell.strip() else "and the cell is empty"
-            raise InputError(f"{self.path}, line {line}: {name} must be a number, {shown}.") from None
-
-    def _cells(self) -> Iterator[tuple[int, list[str]]]:
-        last, left, in_row = "", self._most, 0  # the last line, and characters: of the file, and since the last row
-
-        def lines(text: io.TextIOWrapper) -> Iterator[str]:
-            nonlocal last, left, in_row
-            while last := text.readline(MOST_ROW + 1):
-                in_row += len(last)
-                left -= len(last)
-                if in_row > MOST_ROW:
-                    raise InputError(f"it has a row of more than {MOST_ROW} characters")
-                if left < 0:
-                    raise InputError("it grew while it was read")
-                if "\0" in last:
-                    raise InputError("it is not text in UTF-8: it has NUL bytes")
-                yield last
-
-        with (
-            reworded(f"{self.path} cannot be read as CSV", InputError, OSError, UnicodeDecodeError, csv.Error),
-            open_regular(self.path, self._most) as file,
-            io.TextIOWrapper(file, encoding="utf-8-sig", newline="") as text,
-        ):
-            rest = lines(text)
-            head = [*itertools.takewhile(lambda line: not line.strip(), rest), last]
-            unquoted = re.sub('"[^"]*"', "", last)
-            self._separator = next((mark for mark in ("\t", ";") if mark in unquoted), ",")
-            reader = csv.reader(itertools.chain(head, rest), delimiter=self._separator)
-            for row in reader:
-                in_row = 0
-                if len(row) > 1 or (row and row[0].strip()):
-                    yield reader.line_num, row

@@ -10,7 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctxval._util.columns import CsvTable, column_of, conversion
+from ctxval._util.columns import column_of, conversion
+from ctxval._util.tables import CsvTable
 from ctxval._util.texts import number_in, shortened, unguarded
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import Execution, OpenTrial
@@ -96,7 +97,7 @@ def read_runs(
 
 def _table(path: Path, space: TaskSpace, reading: Mapping[str, Any]) -> list[KnownRun]:
     require_file(path)
-    table = CsvTable(path, 16 * 2**20)
+    table = CsvTable(path, 16 * 2**20, plain=True)
     names = space.names if space.members is None else (TASK,)
     columns = {name: column_of(str(path), table.names, name) for name in names}
     if None in columns.values() or not any(name in table.names for name in _RESULTS):

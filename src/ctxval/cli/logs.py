@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.checked import NonNegativeFloat, require
-from ctxval._util.columns import CsvTable
 from ctxval._util.files import write_text
 from ctxval._util.progress import advance, stage
 from ctxval._util.representation import task_text
+from ctxval._util.tables import CsvTable
 from ctxval.campaign.by_hand import parameters_from, read_runs
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.watching import FALSE_ALARMS

@@ -14,7 +14,6 @@ from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_floats, held_me
 from ctxval._util.columns import (
     EPISODES,
     FAR,
-    CsvTable,
     column_of,
     conversion,
     in_seconds,
@@ -24,6 +23,7 @@ from ctxval._util.columns import (
 )
 from ctxval._util.files import MOST_BYTES, Archive, read_bytes, written_whole
 from ctxval._util.representation import ShortRepr, Shown, call, counted, number
+from ctxval._util.tables import CsvTable
 from ctxval._util.texts import enumerated, guarded, parted, visible
 from ctxval.errors import InputError, ShapeError
 
@@ -255,12 +255,14 @@ class Trajectory:
             wanted = ", ".join(["t", *(states or ("x0", "...")), *(inputs or ("u0", "..."))])
             raise InputError(f"{path} must have the columns {wanted}; it has {_listed(table.names)}.")
         column, unit = time or ("", "s")
-        read = table.columns([column, *x, *u], last=list(u), most=most_rows)
-        if len(times := read[column]) < 2:
+        clock = table.clock_times(column) if time else None
+        read = table.columns([*([] if clock is not None else [column]), *x, *u], last=list(u), most=most_rows)
+        if len(times := read[column] if clock is None else clock) < 2:
             raise InputError(f"{path} must have a header and at least two rows.")
         if any(len(set(table.texts(name))) > 1 for name in table.names if name in EPISODES and name not in read):
             raise InputError(f"{path} has several recordings, which a column numbers; a file must hold one.")
-        seconds = in_seconds(str(path), times, unit or ("s" if column == "t" else ""))
+        unit = "s" if clock is not None else unit or ("s" if column == "t" else "")
+        seconds = in_seconds(str(path), times, unit)
         chosen = (np.array([factor * read[name] for name, factor in part.items()]) for part in (x, u))
         rows = [part.reshape(-1, len(times)).T for part in chosen]
         return Trajectory(seconds, np.ascontiguousarray(rows[0]), np.ascontiguousarray(rows[1][:-1]))

@@ -17,9 +17,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Mask
 from ctxval._util.columns import EPISODES, TIMES, column_of, in_seconds, named_unit, require_distinct, time_column
-from ctxval._util.representation import ShortRepr
+from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.texts import enumerated, quoted, reason_of
 from ctxval.errors import InputError
 
@@ -73,6 +73,7 @@ class Log(ShortRepr, ABC):
 
     source: str  #: the file, and the episode in it, for messages
     period: float | None = None  #: seconds between two samples, if the log states it
+    remarks: Sequence[str] = ()  #: what was left out of signals that were read, one sentence each
 
     @abstractmethod
     def fields(self) -> tuple[str, ...]:
@@ -122,30 +123,60 @@ class Table(Log):
     period: float | None = None  #: seconds between two rows, if the log states it
     #: a function that returns a column whose values are only compared with each other; ``columns`` by default
     marks: Callable[[str], Array] | None = attribute(default=None, repr=False)
+    #: a function that returns a column of dates or clock times in seconds; None if it holds numbers
+    clock: Callable[[str], Array | None] | None = attribute(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        self.remarks: list[str] = []
 
     def fields(self) -> tuple[str, ...]:
         return tuple(self.names)
+
+    def has(self, field: str) -> bool:
+        """Return whether a column is meant by a field, with or without its unit."""
+        return column_of(self.source, self.names, field) is not None
 
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
         require_distinct(self.source, self.names)
         find = partial(column_of, self.source, self.names)
         located = {field: self._located(field, find) for field in fields}
         time, time_unit = self._time(clock)
-        wanted = [*(name for (name, _), _ in located.values()), *filter(None, [time])]
-        arrays = self.columns(list(dict.fromkeys(wanted)))
+        clocked = self.clock(time) if self.clock is not None and time is not None else None
+        wanted = [*(name for (name, _), _ in located.values()), *filter(None, [time] if clocked is None else [])]
+        arrays = dict(self.columns(list(dict.fromkeys(wanted))))
         if time is None:
             times = np.asarray(np.arange(max(map(len, arrays.values()))) * float(clock.period or 0), dtype=np.float64)
         else:
+            if clocked is not None:
+                arrays[time], time_unit = clocked, "s"
             times = self._oriented(time, arrays[time], arrays[time].size)[:, 0]
+        columns = {name: self._oriented(name, arrays[name], len(times)) for (name, _), _ in located.values()}
+        first, word = self.first, self.word
+        if time is not None:
+            kept = self._kept(times, np.hstack([*columns.values()]))
+            if not kept.all():  # the lines of the file no longer count the rows
+                times, columns = times[kept], {name: values[kept] for name, values in columns.items()}
+                first, word = 0, "row"
             if not len(times) or not np.isfinite(times).all():
-                row = self.first + int(np.argmin(np.isfinite(times))) if len(times) else self.first
-                raise InputError(f"{self.source}, {self.word} {row}: the time {time} must be a number.")
+                row = first + int(np.argmin(np.isfinite(times))) if len(times) else first
+                raise InputError(f"{self.source}, {word} {row}: the time {time} must be a number.")
             times = in_seconds(self.source, times, time_unit)
         signals = {}
         for field, ((name, unit), index) in located.items():
-            values = self._component(field, self._oriented(name, arrays[name], len(times)), index)
-            signals[field] = Signal(times, values, self.first, self.word, unit)
+            signals[field] = Signal(times, self._component(field, columns[name], index), first, word, unit)
         return signals
+
+    def _kept(self, times: Array, values: Array) -> Mask:
+        """Return which rows count: rows without any number separate sessions, and a logger may write a row twice."""
+        rows = np.column_stack([times, values])
+        empty: Mask = np.asarray(np.isnan(rows).all(axis=1))
+        same = (rows[1:] == rows[:-1]) | (np.isnan(rows[1:]) & np.isnan(rows[:-1]))
+        twice: Mask = np.asarray(np.append(False, same.all(axis=1)) & ~empty)
+        for rows_of, what in ((empty, "no number in it"), (twice, "a copy of the one before")):
+            count = int(rows_of.sum())
+            if count and (text := f"{self.source}: {counted(count, self.word)} left out ({what})") not in self.remarks:
+                self.remarks.append(text)
+        return ~(empty | twice)
 
     def episodes(self, used: Sequence[str]) -> list[Log]:
         """Return one table for each run of rows with one number in a column such as ``episode``."""
@@ -155,7 +186,7 @@ class Table(Log):
         if not marks or len({len(values) for values in marks}) > 1:
             return [self]
         changed = np.any([mark[1:] != mark[:-1] for mark in marks], axis=0)
-        count, read = len(marks[0]), dict[str, Array]()
+        count, read, clocks = len(marks[0]), dict[str, Array](), dict[str, Array | None]()
 
         def rows(start: int, stop: int, names: Sequence[str]) -> dict[str, Array]:
             if missing := [name for name in names if name not in read]:  # each column is read once for all episodes
@@ -166,10 +197,17 @@ class Table(Log):
                     raise InputError(f"{self.source}: {name} must have {wanted}, got {read[name].shape}.")
             return {name: read[name][start:stop] for name in names}
 
+        def clocked(start: int, stop: int, name: str) -> Array | None:
+            if name not in clocks:
+                clocks[name] = self.clock(name) if self.clock else None
+            return None if (times := clocks[name]) is None else times[start:stop]
+
         def episode(start: int, stop: int) -> Table:
             number = str(marks[0][start]).removesuffix(".0")
             source, columns = f"{self.source}, {counters[0].partition('_')[0]} {number}", partial(rows, start, stop)
-            return Table(source, self.names, columns, word=self.word, first=self.first + start, period=self.period)
+            part = Table(source, self.names, columns, word=self.word, first=self.first + start, period=self.period)
+            part.clock, part.remarks = self.clock and partial(clocked, start, stop), self.remarks
+            return part
 
         return [episode(*ends) for ends in pairwise([0, *(np.flatnonzero(changed) + 1).tolist(), count])]
 

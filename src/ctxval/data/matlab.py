@@ -52,14 +52,40 @@ def read_mat(path: Path) -> list[Log]:
         if recordings := {name: value for name, value in content.items() if is_control_desk(value)}:
             sources = {name: f"{path}, {name}" if len(recordings) > 1 else str(path) for name in recordings}
             return [ControlDeskLog(sources[name], structure) for name, structure in recordings.items()]
+        content = {name: value for name, value in content.items() if name[:2] != "__"}
+        simulink = {name: signals for name, value in content.items() if (signals := _of_simulink(value))}
+        content = simulink.popitem()[1] if len(content) == len(simulink) == 1 else {**content, **simulink}
         numbers = (pair for pair in leaves(content) if isinstance(pair[1], np.ndarray | int | float))
         arrays = ((path, np.asarray(value)) for path, value in numbers)
-        # Names that begin with underscores are those of what the reader says of the file.
-        numeric = ((path, array) for path, array in arrays if array.dtype.kind in "biuf" and path[:2] != "__")
+        numeric = ((path, array) for path, array in arrays if array.dtype.kind in "biuf")
         columns = {path: array.astype(np.float64) for path, array in numeric if array.ndim <= 2 and array.size}
     if not columns:
         raise InputError(f"{path} has no numeric array.")
+    if len(columns) == 1 and (rows := _timed_rows(*next(iter(columns.items())))):
+        columns = rows
     return [MemoryTable(str(path), columns)]
+
+
+def _of_simulink(value: Any) -> dict[str, Any]:
+    """Return the times and the signals, by their labels, of a Structure With Time of Simulink; empty for others."""
+    if not isinstance(value, Mapping) or not {"time", "signals"} <= value.keys():
+        return {}
+    signals = [value["signals"]] if isinstance(value["signals"], Mapping) else np.ravel(value["signals"]).tolist()
+    if not all(isinstance(signal, Mapping) and "values" in signal for signal in signals):
+        return {}
+    labels = [str(signal.get("label") or f"signal{k}") for k, signal in enumerate(signals, 1)]
+    labels = _distinct(labels, [f"{label}{k}" for k, label in enumerate(labels, 1)])
+    return {"time": value["time"], **{label: each["values"] for label, each in zip(labels, signals, strict=True)}}
+
+
+def _timed_rows(name: str, array: Array) -> dict[str, Array]:
+    """Return the rows of a matrix that a block To File writes, the first of which are the times; empty for others."""
+    steps = np.diff(array[0]) if array.ndim == 2 else np.zeros(1)
+    if array.ndim != 2 or not 2 <= len(array) < array.shape[1] or not (steps > 0).all():
+        return {}
+    if name != "ans" and np.ptp(steps) > 1e-3 * steps.mean():  # the block's usual name; else a state may rise
+        return {}
+    return {"time": array[0], **{f"{name}{k}": row for k, row in enumerate(array[1:], 1)}}
 
 
 def _version_7_3(path: Path) -> dict[str, Any]:

@@ -18,9 +18,10 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import PositiveFloat, require
-from ctxval._util.columns import CsvTable
 from ctxval._util.files import MOST_BYTES, Archive, read_bytes, read_json, require_regular_file
 from ctxval._util.refusals import require_extra, reworded
+from ctxval._util.tables import CsvTable
+from ctxval.data.joined import joined_topics, read_ulog
 from ctxval.data.log import Log, MemoryTable, Table, leaves, reading
 from ctxval.data.matlab import read_mat
 from ctxval.data.messages import BagLog, McapLog
@@ -28,13 +29,17 @@ from ctxval.errors import InputError
 
 
 def read_csv(path: Path) -> list[Log]:
-    """Return the log in a CSV file with a header, whose columns may state their units; an empty cell is NaN."""
+    """Return the log in a CSV file with a header, whose columns may state their units; a missing value is NaN."""
     table = CsvTable(path)
     names = tuple(filter(None, table.names))
     if not names:
         raise InputError(f"{path} must be a table with one name for each column, and has no header.")
     first = next((line for line, _ in table.rows()), 2)
-    return [Table(str(path), names, partial(table.columns, missing=names), word="line", first=first, marks=table.texts)]
+    columns = partial(table.columns, missing=names)
+    clock = table.clock_times
+    whole = Table(str(path), names, columns, word="line", first=first, marks=table.texts, clock=clock)
+    whole.remarks = table.remarks
+    return [whole]
 
 
 def read_npz(path: Path) -> list[Log]:
@@ -165,9 +170,10 @@ def read_json_records(path: Path) -> list[Log]:
 # Files and folders
 
 READERS: dict[str, Callable[[Path], list[Log]]] = {
-    ".csv": read_csv,
+    **dict.fromkeys((".csv", ".txt", ".tsv", ".dat", ".lvm"), read_csv),
     ".npz": read_npz,
     ".mat": read_mat,
+    ".ulg": read_ulog,
     ".parquet": read_parquet,
     ".mcap": lambda path: [McapLog(path)],
     ".db3": lambda path: [BagLog(path)],
@@ -185,19 +191,19 @@ def read_logs(paths: Sequence[str | Path]) -> list[Log]:
     """Return the logs in files and folders.
 
     A folder is a bag of ROS 2 if it has a file ``metadata.yaml``, a LeRobot data set if it has ``meta/info.json``, and
-    otherwise all logs in it are read, in the order of their names.
+    otherwise all logs in it are read, in the order of their names. Files with the topics of one recording are one log.
     """
     logs = [log for path in paths for log in _logs(Path(path))]
     if not logs:
         raise InputError("there is no log: give at least one file or folder.")
-    return logs
+    return joined_topics(logs)
 
 
 def is_log(path: Path) -> bool:
     """Return whether a path can only be a log of a program: no CSV, NPZ or JSON file, and no plain folder."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file() or is_lerobot(path)
-    return path.suffix.lower() in READERS.keys() - {".csv", ".npz", ".json"}
+    return path.suffix.lower() in READERS.keys() - {".csv", ".npz", ".json", ".txt", ".tsv", ".dat"}
 
 
 def is_lerobot(path: Path) -> bool:
@@ -221,7 +227,9 @@ def _logs(path: Path) -> list[Log]:
 
 def logs_in(folder: Path) -> list[Path]:
     """Return the files of a folder that are logs, in the order of their names."""
-    files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in READERS] if folder.is_dir() else []
+    named = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in READERS] if folder.is_dir() else []
+    # Files such as a README.txt lie beside logs.
+    files = [file for file in named if file.suffix.lower() not in (".txt", ".dat")] or named
     if not files:
         raise InputError(f"the folder {folder} has no log: {_READABLE}.")
     return files

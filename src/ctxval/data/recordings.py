@@ -71,7 +71,7 @@ def read_recordings(
     """Return the recordings in files and folders.
 
     Args:
-        paths: CSV, NPZ, MATLAB, Parquet and MCAP files, ROS bags, LeRobot data sets, or folders of such files.
+        paths: CSV, NPZ, MATLAB, Parquet, ULog and MCAP files, ROS bags, LeRobot data sets, or folders of such files.
         mapping: which fields are states and inputs; by default, they are found by the names below, or by usual names.
         states, inputs: names and units of an experiment, to which values are converted.
         changes: other values of the mapping, such as ``dt`` and ``delay``.
@@ -130,6 +130,7 @@ def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], not
         clock = replace(clock, period=mapping.dt)
     paths = [field.path for field in mapping.fields.values()]
     signals = log.signals([*paths, *([condition[0]] if condition else [])], clock)
+    notes += log.remarks
     channels: list[Channel] = []
     for name, field in mapping.fields.items():
         signal = signals[field.path]
