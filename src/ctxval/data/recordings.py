@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
-from ctxval._util.columns import FAR, conversion, sentinels, time_column, unit_advice
+from ctxval._util.columns import FAR, column_of, conversion, sentinels, time_column, unit_advice
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr, call, counted
@@ -20,6 +20,7 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.log import Log, Signal, Table
 from ctxval.data.mapping import LogMapping, Observer
+from ctxval.data.rates import Clocked, Column, require_scale
 from ctxval.data.readers import component_names, logs_in, read_logs
 from ctxval.data.sampling import Break, Channel, sampled
 from ctxval.errors import ExecutionError, InputError
@@ -117,8 +118,22 @@ def recordings_of(
         how.append(f"inputs act {chosen.delay:g} s after they are logged")
     states = {channel.name: channel.unit for channel in first if not channel.of_input}
     inputs = {channel.name: channel.unit for channel in first if channel.of_input}
+    clock = _clocked(logs[0], chosen)
+    columns = [Column(channel.name, channel.unit, channel.of_input, channel.scaled) for channel in first]
+    by_source = {run.source: [each.trajectory for each in runs if each.source == run.source] for run in runs[:100]}
+    for source, some in [*by_source.items(), ("all logs", [run.trajectory for run in runs])]:
+        notes += require_scale(source, some, columns, dt, clock)
     whole = Recordings(tuple(runs), tuple(breaks), dt, states, inputs, (*how, *dict.fromkeys(notes)))
     return _with_lags(_with_observer(_with_derivatives(whole, chosen), chosen), chosen.lags)
+
+
+def _clocked(log: Log, mapping: LogMapping) -> Clocked:
+    """Return in which unit the times of a log are taken, and who states it."""
+    if not isinstance(log, Table):
+        return Clocked()  # messages have times in nanoseconds
+    found = (log.source, log.fields())
+    column = time_column(*found) if mapping.time is None else column_of(*found, mapping.time)
+    return Clocked() if column is None else Clocked.of(*column, mapping.time_unit, stated=mapping.dt is not None)
 
 
 def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], notes: list[str]) -> list[Channel]:
@@ -147,7 +162,7 @@ def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], not
             _without_marks(f"{log.source}: {label}", column, scale, signal, notes)
             unit = field.unit or (signal.unit if field.factor is None else "")
             converted = scale * column + field.offset
-            about = field.angle, field.held, field.path, (signal.word, signal.first)
+            about = field.angle, field.held, field.path, (signal.word, signal.first), field.factor is not None
             channels.append(Channel(label, unit, name in mapping.inputs, signal.times, converted, *about))
     # In LeRobot data sets, states and actions have the same names.
     states = {channel.name for channel in channels if not channel.of_input}

@@ -45,6 +45,7 @@ class Channel(ShortRepr):
     held: bool = False  #: whether a value holds until the next one, however long that takes
     path: str = ""  #: its field in the log
     place: tuple[str, int] = ("row", 0)  #: what counts its samples in messages, and the number of the first one
+    scaled: bool = False  #: whether the user states its factor
 
     @property
     def period(self) -> float:
