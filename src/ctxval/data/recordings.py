@@ -194,16 +194,13 @@ def _in_unit_of(log: Log, channel: Channel, first: Channel) -> Channel:
 
 
 def _mean_period(log: Log, channel: Channel) -> float:
-    """Return the mean period, in which longer steps count as several ones."""
-    steps = np.diff(channel.times)
-    steps = steps[np.isfinite(steps) & (steps > 0)]
-    if not len(steps):
+    """Return the mean period of a channel, rounded if that does not move a sample."""
+    period, steps = channel.period, np.diff(channel.recorded)
+    if not period:
         raise InputError(f"{log.source} has fewer than two samples of {channel.path}, so its time step is unknown.")
-    counts = np.maximum(np.rint(steps / np.median(steps)), 1)
-    period = float(steps.sum() / counts.sum())
     rounded = float(f"{period:.6g}")
     # A rounded step must not drift away from the samples over the whole recording.
-    return rounded if abs(rounded - period) * counts.sum() < 1e-3 * period else period
+    return rounded if abs(rounded - period) * steps[steps > 0].sum() < 1e-3 * period**2 else period
 
 
 # States that are not recorded but follow from records: derivatives, and records of earlier steps
