@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from ctxval._util.columns import (
 from ctxval._util.files import MOST_BYTES, Archive, read_bytes, written_whole
 from ctxval._util.representation import ShortRepr, Shown, call, counted, number
 from ctxval._util.texts import enumerated, guarded, parted, visible
+from ctxval.core.labels import require_same_units
 from ctxval.errors import InputError, ShapeError
 
 COMPLETE = "complete"
@@ -34,13 +35,16 @@ COMPLETE = "complete"
 class Transitions(ShortRepr):
     """Recorded steps of a system: in state x ``(N, n)``, the input u ``(N, m)`` led to x_next ``(N, n)``.
 
-    The length of a step, dt in seconds, is None if it is not known.
+    The length of a step, dt in seconds, is None if it is not known. The states and inputs may have names with units;
+    these are empty if they are not known.
     """
 
     x: Array
     u: Array
     x_next: Array
     dt: float | None = None
+    states: Mapping[str, str] = field(default_factory=dict)
+    inputs: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("x", "u", "x_next"):
@@ -50,7 +54,7 @@ class Transitions(ShortRepr):
             raise ShapeError(f"transitions need x (N, n), u (N, m) and x_next (N, n), got {got}.")
 
     def __getitem__(self, rows: slice | Rows | Mask) -> Transitions:
-        return Transitions(self.x[rows], self.u[rows], self.x_next[rows])
+        return replace(self, x=self.x[rows], u=self.u[rows], x_next=self.x_next[rows])
 
     def __len__(self) -> int:
         return len(self.x)
@@ -66,7 +70,13 @@ class Transitions(ShortRepr):
         if steps and not np.allclose(steps, steps[0], rtol=1e-3, atol=0):
             raise InputError(f"recorded steps must have one length, got {min(steps):g} s and {max(steps):g} s.")
         x, u, x_next = (np.concatenate([getattr(part, name) for part in parts]) for name in ("x", "u", "x_next"))
-        return Transitions(x, u, x_next, steps[0] if steps else None)
+        named = dict[str, Mapping[str, str]]()
+        for kind in ("states", "inputs"):
+            known = [getattr(part, kind) for part in parts if getattr(part, kind)]
+            for other in known[1:]:
+                require_same_units("recorded steps", known[0], "others", other)
+            named[kind] = known[0] if known else {}
+        return Transitions(x, u, x_next, steps[0] if steps else None, **named)
 
 
 @dataclass(frozen=True, eq=False)

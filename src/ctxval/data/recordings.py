@@ -56,7 +56,7 @@ class Recordings(ShortRepr):
         numbers = list(range(len(self.runs)) if runs is None else runs)
         parts = [self.runs[number].trajectory.transitions() for number in numbers]
         of = np.repeat(np.array(numbers, dtype=np.intp), [len(part) for part in parts])
-        return replace(Transitions.joined(parts), dt=self.dt), of
+        return replace(Transitions.joined(parts), dt=self.dt, states=self.states, inputs=self.inputs), of
 
 
 def read_recordings(

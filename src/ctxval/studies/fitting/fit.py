@@ -21,6 +21,7 @@ from ctxval.errors import InputError, ModelError, UnknownNameError
 from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.parametric import ParametricStep
 from ctxval.studies.replay.accuracy import StepError, step_errors, stepped
+from ctxval.studies.replay.units import in_units_of
 
 Kind = Literal["linear", "network", "gaussian-process", "parameters", "given"]
 KINDS: tuple[Kind, ...] = get_args(Kind)[:4]
@@ -130,6 +131,9 @@ def fit(
         if step is None or not bounds:
             raise InputError("the kind 'parameters' needs a function (x, u, theta) -> x_next and the bounds of theta.")
         as_bounds(bounds)
+    if given is not None:
+        require_time_step(given, recordings.dt, "the recording")
+        recordings = in_units_of(given, recordings)
     learned_from, held_out = split(recordings, hold_out, seed)
     data, _ = learned_from.transitions()
     fitted, failed = list[FittedModel](), list[FailedFit]()
@@ -141,7 +145,6 @@ def fit(
     with single_threaded():
         # Before anything is learned, because what is named must be usable.
         if given is not None:
-            require_time_step(given, recordings.dt, "the recording")
             add("given", given)
         for kind in dict.fromkeys(kinds):
             try:

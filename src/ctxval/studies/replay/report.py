@@ -25,6 +25,7 @@ from ctxval.learning.closed_loops import loop_pairs
 from ctxval.studies.replay import causes
 from ctxval.studies.replay.accuracy import RegionalError, StepError, regions, step_errors
 from ctxval.studies.replay.causes import Fault, ResidualShare, Suggestion
+from ctxval.studies.replay.units import in_units_of
 
 STEPS = (1, 5, 20, 100)  #: numbers of steps after which errors are computed, unless others are given
 
@@ -189,6 +190,7 @@ def replay(
                 f"{unit_advice(recordings.dt, task.dt) or f'give dt = {task.dt:g} in the mapping of the recordings'}."
             )
     require_time_step(model, recordings.dt, "the recording")
+    recordings = in_units_of(model, recordings)
     new = unseen(model, recordings)
     used = new or list(range(len(recordings.runs)))
     recorded = replace(recordings, runs=tuple(recordings.runs[number] for number in used))
