@@ -54,14 +54,19 @@ class Channel(ShortRepr):
         return np.asarray(self.times[np.isfinite(self.values)])
 
     @cached_property
+    def rhythm(self) -> tuple[float, float]:
+        """The mean and the longest usual time between two samples, seconds, in which longer steps count as several."""
+        return _rhythm(self.recorded if len(self.recorded) > 1 else self.times)
+
+    @property
     def period(self) -> float:
-        """The mean time between two samples, seconds, in which longer steps count as several; 0 if there are none."""
-        return _rhythm(self.recorded)[0]
+        """The mean time between two samples, seconds; 0 if there are fewer than two."""
+        return self.rhythm[0]
 
     @property
     def longest(self) -> float:
-        """The longest usual time between two samples, seconds: 1.5 periods, or 1.5 times the usual longer steps."""
-        return 1.5 * _rhythm(self.recorded)[1]
+        """The longest time between two samples without a gap, seconds: 1.5 periods, or usual longer steps."""
+        return 1.5 * self.rhythm[1]
 
 
 def _rhythm(times: Array) -> tuple[float, float]:
