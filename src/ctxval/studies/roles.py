@@ -36,7 +36,7 @@ _OTHERS = (
     "success run trial"
 )
 _COMMAND_UNITS = re.compile(r"[kmu]?(N|Nm|N ?m|V|A|W)|%|pwm|duty", re.IGNORECASE)
-_STATE_UNITS = re.compile(r"[cmk]?m|m?rad|deg|°|rev|rpm|(°|deg ?)?[CKF]|m?bar|[kM]?Pa|m\^?3|[lL]|pH|.+/(s|h|min)(\^?2)?")
+_STATE_UNITS = re.compile(r"[cmk]?m|m?rad|deg|°|rev|rpm|(°|deg ?)?[CKF]|m?bar|[kM]?Pa|m\^?3|[lL]|.+/(s|h|min)(\^?2)?")
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from ctxval.data.recordings import Recordings
 from ctxval.errors import InputError, ModelError, UnknownNameError
 from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.parametric import ParametricStep
-from ctxval.studies.replay.accuracy import StepError, step_errors, stepped
+from ctxval.studies.replay.accuracy import StepError, step_errors, stepped, useless
 from ctxval.studies.replay.units import in_units_of
 
 Kind = Literal["linear", "network", "gaussian-process", "parameters", "given"]
@@ -63,9 +63,7 @@ class FittedModel(ShortRepr):
     @property
     def useless(self) -> str | None:
         """Why the model is no better than no model after one step, or after the largest number; None if it is."""
-        ends = [error for error in self.errors if error.steps in (1, self.steps)]
-        worst = max(ends, key=lambda error: error.relative, default=None)
-        if worst is None or worst.relative < 1:
+        if (worst := useless(self.errors)) is None:
             return None
         return (
             f"the {self.kind} model is no better than to predict no change: its held-out error of {worst.state} after "

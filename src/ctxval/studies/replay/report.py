@@ -23,7 +23,7 @@ from ctxval.errors import InputError
 from ctxval.learning import DynamicsStudy
 from ctxval.learning.closed_loops import loop_pairs
 from ctxval.studies.replay import causes
-from ctxval.studies.replay.accuracy import RegionalError, StepError, regions, step_errors
+from ctxval.studies.replay.accuracy import RegionalError, StepError, regions, step_errors, useless
 from ctxval.studies.replay.causes import Fault, ResidualShare, Suggestion
 from ctxval.studies.replay.units import in_units_of
 
@@ -254,11 +254,11 @@ def _insights(report: ReplayReport, used: int) -> Iterator[str]:
     if not single:
         yield "no recording has a single step, so nothing can be compared"
         return
-    worst = max(single, key=lambda error: error.relative)
-    if worst.relative >= 1:
+    worst, fault = max(single, key=lambda error: error.relative), useless(errors)
+    if fault is not None and fault.steps == 1:
         yield (
-            f"the model predicts {worst.state} no better than no change at all: its one-step error is "
-            f"{100 * worst.relative:.0f} % of the recorded change"
+            f"the model predicts {fault.state} no better than no change at all: its one-step error is "
+            f"{100 * fault.relative:.0f} % of the recorded change"
         )
     steps = max(error.steps for error in errors)
     late = ", ".join(error.state for error in errors if error.steps == steps and error.relative >= 1)
