@@ -35,8 +35,8 @@ _COUNTS = (400, 500, 1000, 2000, 2048, 4000, 8000, 10_000, *(2**k for k in range
 _MACHINES, _MACHINES_STATED, _PROCESSES, _ANY = (1e-4, 1.5), (1e-4, 10.0), (1e-2, 9e4), (1e-6, 3600.0)
 
 # Words in names of fields.
-_RATES = "rate rates speed speeds vel velocity velocities omega dq qd gyro twist dot rpm drehzahl"
-_POSITIONS = "pos position positions angle angles theta phi psi q x y z yaw pitch roll heading encoder"
+_RATES = "rate rates speed speeds vel velocity velocities omega dq qd gyro twist dot rpm drehzahl geschwindigkeit"
+_POSITIONS = "pos position positions angle angles theta phi psi q x y z yaw pitch roll heading encoder winkel"
 _FORCES = "torque motor joint force throttle rudder steer steering wheel"
 _PROCESS = "temp temperature temperatures level pressure flow heater valve tank concentration humidity ph"
 _GENERAL = f"{_RATES} pos position positions angle angles encoder angular linear state v w"
@@ -62,6 +62,8 @@ class Column(ShortRepr):
             if self.unit and _factor(self.unit, base + ("", "/s", "/s^2")[order]) is not None:
                 return order
         words = words_of(self.name)
+        if not set(words).isdisjoint(_PROCESS.split()):
+            return None  # the rate of a level is no flow, but in proportion to it
         if any(_ACCELERATION.fullmatch(word) for word in words):
             return 2
         if any(word in _RATES.split() or _RATE.fullmatch(word) for word in words):
@@ -179,7 +181,7 @@ def _named_pairs(columns: Sequence[Column]) -> set[tuple[int, int]]:
                 i for i, each in enumerate(orders) if not columns[i].of_input and (each or 0) == order - 1 and i != j
             ]
             alike = [i for i in below if stems[i] == stems[j]]
-            exact = [i for i in below if orders[i] == order - 1]
+            exact = [i for i in below if orders[i] == order - 1] or below
             if len(alike) == 1 or (len(exact) == 1 and orders.count(order) == 1):
                 named.add((alike[0] if len(alike) == 1 else exact[0], j))
     return named
@@ -202,16 +204,14 @@ def _steady(x: Array) -> Array:
     """Return states without single outliers and without the jumps of an angle that is kept within a turn."""
     if len(x) < 3:
         return x
-    x = np.vstack([x[:1], np.median([x[:-2], x[1:-1], x[2:]], axis=0), x[-1:]])
-    steps = np.diff(x, axis=0)
-    jumps = np.abs(steps) > 0.4 * np.ptp(x, axis=0)
-    usual = np.where(jumps, 0.0, np.abs(steps)).max(axis=0) < 0.2 * np.ptp(x, axis=0)
-    jumps &= usual
-    if jumps.any():
+    steps, spans = np.diff(x, axis=0), np.ptp(x, axis=0)
+    jumps = np.abs(steps) > 0.4 * spans
+    jumps &= np.where(jumps, 0.0, np.abs(steps)).max(axis=0) < 0.2 * spans
+    if jumps.any():  # the step before a jump goes on
         rows = np.maximum.accumulate(np.where(jumps, 0, np.arange(len(steps))[:, None]), axis=0)
-        steps = np.take_along_axis(np.where(jumps, 0.0, steps), rows, axis=0)  # the step before the jump
+        steps = np.take_along_axis(np.where(jumps, 0.0, steps), rows, axis=0)
         x = np.vstack([x[:1], x[0] + np.cumsum(steps, axis=0)])
-    return x
+    return np.vstack([x[:1], np.median([x[:-2], x[1:-1], x[2:]], axis=0), x[-1:]])
 
 
 def require_scale(
@@ -244,13 +244,19 @@ def require_scale(
             )
     notes = list[str]()
     for pair in pairs:
-        if not pair.named or (pair.ratio > 0 and _near(pair.relative, 1.0, math.log(2))):
+        if pair.ratio > 0 and _near(pair.relative, 1.0, math.log(2)):
+            continue
+        if not pair.named and not _near(abs(math.log(pair.relative)), math.log(180 / math.pi), 0.003):
             continue
         why, far = _explanation(pair), pair.ratio < 0 or not _near(pair.relative, 1.0, math.log(20))
         sentence = f"{pair}{why and f', as if {why}'}"
-        if why and far and not pair.state.scaled and not pair.rate.scaled:
-            units = "state the units of both in the header, such as [rad] and [rad/s], or in a mapping"
-            raise InputError(f"{source}: {sentence}; {units}, or their factors (factor = 1 keeps the values).")
+        if why and far and pair.named and not pair.state.scaled and not pair.rate.scaled:
+            how = (
+                f"state the units of both in the header, as {pair.state.name} [UNIT], or in a mapping, or their factors"
+            )
+            if _near(abs(pair.relative), 1.0, 0.1):
+                how = "turn one of them with factor = -1 in a mapping"
+            raise InputError(f"{source}: {sentence}; {how} (factor = 1 keeps the values).")
         notes.append(sentence)
     return notes
 
