@@ -72,25 +72,26 @@ class Channel(ShortRepr):
 def _rhythm(times: Array) -> tuple[float, float]:
     """Return the mean period of times, and the longer of it and of the usual longer steps if their steps differ.
 
-    Times may come in bursts, or with a jitter that is not small against the period. So the period is that of runs of
-    as many steps as make it the least uncertain.
+    Times may come in bursts, or with a jitter that is not small against the period. So steps are counted in runs of as
+    few steps as differ in length by less than half a period, or else of as many as make the period least uncertain.
     """
     steps = np.diff(times)
     steps = steps[steps > 0]
     if not len(steps):
         return 0.0, 0.0
-    ends = np.concatenate([[0.0], np.cumsum(steps)])
-    best, spread, period = 1, np.inf, float(np.median(steps))
+    ends, spreads = np.concatenate([[0.0], np.cumsum(steps)]), dict[tuple[int, float], float]()
     for count in (1, 2, 3, 4, 5, 6, 8, 10, 16):
-        if len(steps) >= 4 * count:
-            low, middle, high = np.quantile((ends[count:] - ends[:-count]) / count, [0.25, 0.5, 0.75])
-            if high - low < 0.6 * spread and spread > 1e-3 * middle:
-                best, spread, period = count, float(high - low), float(middle)
-    whole = (len(steps) // best) * best
-    runs = np.add.reduceat(steps[:whole], np.arange(0, whole, best))
-    counts = np.maximum(np.rint(runs / period), best)
-    mean = float(runs.sum() / counts.sum())
-    return mean, mean if best == 1 else max(mean, float(np.quantile(steps, 0.75)))
+        if count == 1 or len(steps) >= 4 * count:
+            low, middle, high = (np.quantile(ends[count:] - ends[:-count], [0.25, 0.5, 0.75]) / count).tolist()
+            spreads[count, middle] = high - low
+            if count * (high - low) < 0.4 * middle:
+                break
+    best, period = min(spreads, key=spreads.__getitem__)
+    starts = np.arange(0, len(steps), best * -(-8 // best))
+    runs, lengths = np.add.reduceat(steps, starts), np.diff(starts, append=len(steps))
+    for _ in range(4):  # a better period counts better
+        period = float(runs.sum() / np.maximum(np.rint(runs / period), lengths).sum())
+    return period, period if best == 1 else max(period, float(np.quantile(steps, 0.75)))
 
 
 def sampled(

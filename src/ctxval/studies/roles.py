@@ -95,10 +95,12 @@ class Evidence(ShortRepr):
         if not words.isdisjoint(_COMMANDS.split()):
             return 6.0
         hint = 0.0
-        if unit:
-            hint += 2.0 if _COMMAND_UNITS.fullmatch(unit) else -3.0 if _STATE_UNITS.fullmatch(unit) else 0.0
-        hint += 1.5 * (not words.isdisjoint(_ACTUATORS.split()))
-        known = not words.isdisjoint([*_STATES.split(), *_THERMAL.split()]) or Column(self.path, unit).order in (0, 1)
+        acts = not words.isdisjoint(_ACTUATORS.split())
+        if unit:  # a rudder may be in degrees, but u in m/s is a speed
+            of_state = -1.0 if acts and words != {"u"} else -3.0
+            hint += 2.0 if _COMMAND_UNITS.fullmatch(unit) else of_state if _STATE_UNITS.fullmatch(unit) else 0.0
+        hint += 2.0 * acts
+        known = not words.isdisjoint([*_STATES.split(), *_THERMAL.split()]) or Column(self.path).order in (0, 1)
         single = self.path.casefold() != "u" and len("".join(words - {*"0123456789"})) == 1
         hint -= (0.5 if single else 1.5) * known
         return hint - 3.0 * (not words.isdisjoint(_MEASURED.split()) and hint <= 0)
