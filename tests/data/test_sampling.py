@@ -308,7 +308,7 @@ def test_rows_of_a_joined_table_without_a_state_do_not_count_in_its_period(state
 
 RHYTHMS = {
     "jitter": lambda t, rng: t + rng.uniform(-0.008, 0.008, len(t)),
-    "skewed jitter": lambda t, rng: np.sort(t + rng.exponential(0.004, len(t))),
+    "skewed jitter": lambda t, rng: np.sort(t + rng.exponential(0.002, len(t))),
     "pairs": lambda t, rng: np.sort(np.where(np.arange(len(t)) % 2, t - 0.019, t)),
     "lost": lambda t, rng: t[np.sort(rng.permutation(len(t))[: int(0.9 * len(t))])],
     "jitter and lost": lambda t, rng: (t + rng.uniform(-0.004, 0.004, len(t)))[rng.random(len(t)) > 0.1],

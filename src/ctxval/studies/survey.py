@@ -88,9 +88,7 @@ class Survey(ShortRepr):
         if close == compared:
             suits = f"at least {far}, as long as was compared: it suits tasks in the recorded range"
         if first > 1:
-            suits += (
-                f"; over less than {counted(first, 'step')} the records move too little, against their noise, to tell"
-            )
+            suits += f"; over less than {first} steps, noise hides the motion"
         return f"{model} errs by less than {share} for {suits}"
 
     def to_json(self) -> dict[str, Any]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from itertools import chain
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Mask
 from ctxval._util.texts import enumerated
 from ctxval.core.labels import factors_between, labels_of, units_of
 from ctxval.core.model import Model
@@ -27,8 +26,8 @@ def in_units_of(model: Model, recordings: Recordings) -> Recordings:
         InputError: if two units cannot be converted, or if units are not stated and the errors of the model show that
             they differ: another unit makes them small.
     """
-    named, notes, factors = list[dict[str, str]](), list[str](), list[Array]()
-    places = list[list[int]]()
+    named, notes = list[dict[str, str]](), list(recordings.notes)
+    places, factors, unknown = list[list[int]](), list[Array](), list[bool]()
     for known, recorded in zip(units_of(model), (recordings.states, recordings.inputs), strict=True):
         wanted = known if len(known) == len(recorded) else recorded
         order = list(wanted) if wanted.keys() == recorded.keys() else list(recorded)
@@ -39,6 +38,8 @@ def in_units_of(model: Model, recordings: Recordings) -> Recordings:
             if factor != 1:
                 notes.append(f"{label} is converted to {other}, as the model takes it")
         named.append({name: mine or unit for (name, unit), mine in zip(ordered.items(), wanted.values(), strict=True)})
+        stated = known.values() if wanted is known else [""] * len(recorded)
+        unknown += [not (unit and mine) for unit, mine in zip(ordered.values(), stated, strict=True)]
 
     def converted(run: Trajectory) -> Trajectory:
         x, u = (
@@ -47,21 +48,17 @@ def in_units_of(model: Model, recordings: Recordings) -> Recordings:
         return replace(run, states=x, inputs=u)
 
     runs = tuple(replace(run, trajectory=converted(run.trajectory)) for run in recordings.runs)
-    notes = [*recordings.notes, *notes]
     whole = replace(recordings, runs=runs, states=named[0], inputs=named[1], notes=tuple(notes))
-    _require_scales(model, whole, *units_of(model))
+    _require_scales(model, whole, np.array(unknown))
     return whole
 
 
-def _require_scales(model: Model, recordings: Recordings, states: Mapping[str, str], inputs: Mapping[str, str]) -> None:
-    """Refuse recordings that the model predicts only if states or inputs are divided by a factor between two units."""
+def _require_scales(model: Model, recordings: Recordings, unknown: Mask) -> None:
+    """Refuse recordings that the model predicts only if those of unknown units are divided by a factor of two units."""
     where = Windows.of(recordings, 0, 1, 500)
     if not len(where) or (usual := _error(model, where, 1.0, 1.0)) < 0.5:
         return
     n, names = len(recordings.states), [*recordings.states, *recordings.inputs]
-    units = chain(recordings.states.values(), recordings.inputs.values())
-    stated = [bool(unit) for unit in (states | inputs).values()] if len(states | inputs) == len(names) else []
-    unknown = np.array([not (unit and each) for unit, each in zip(units, stated or [False] * len(names), strict=True)])
     groups = [np.arange(len(names)) < n, *(np.arange(len(names)) == k for k in range(len(names)))]
     tried = dict[tuple[int, float], float]()
     for number, group in enumerate(groups):
