@@ -230,7 +230,8 @@ def require_scale(
         for pair in pairs:
             for unit, factor in _TIMES.items():
                 step = dt * factor / _TIMES[clock.unit]
-                explains = unit != clock.unit and _near(pair.relative * dt, step, 0.02)
+                explains = unit != clock.unit and _near(pair.relative * dt, step, 0.08 if pair.named else 0.02)
+                explains &= not _near(pair.relative, 180 / math.pi, 0.023)  # nearer to this than to 60
                 if explains and (pair.named or not usual) and (low <= step <= high or step > dt):
                     times = f"as if {clock.column} were in {unit}: a step would take {step:.4g} s instead of {dt:.4g} s"
                     raise InputError(f"{source}: {pair}, {times}; {clock.advice(unit)}.")
@@ -248,9 +249,10 @@ def require_scale(
             continue
         if not pair.named and not _near(abs(math.log(pair.relative)), math.log(180 / math.pi), 0.003):
             continue
-        why, far = _explanation(pair), pair.ratio < 0 or not _near(pair.relative, 1.0, math.log(20))
+        why, far = _explanation(pair), pair.ratio < 0 or not _near(pair.relative, 1.0, math.log(15))
         sentence = f"{pair}{why and f', as if {why}'}"
-        if why and far and pair.named and not pair.state.scaled and not pair.rate.scaled:
+        # A ratio that no two units explain is an error if no other pair of the log agrees.
+        if far and (why or not agreeing) and pair.named and not pair.state.scaled and not pair.rate.scaled:
             how = (
                 f"state the units of both in the header, as {pair.state.name} [UNIT], or in a mapping, or their factors"
             )
