@@ -44,11 +44,14 @@ def case(rng: Rng, folder: Path, base: Path) -> Case:
     (folder / "run.csv").write_text("\n".join([",".join(head), *rows]) + "\n")
     np.savez(folder / "model.npz", A=[[1.0, dt], [0.0, 1.0]], B=[[0.0], [dt]])
     right = (stated or "s") == unit and told and sign > 0
+    ratio = by / rated / (_TIMES[unit] / _TIMES[stated or "s"])  # minutes and degrees nearly make up for each other
     fields = ("--state", names[0], "--state", names[1], "--input", "voltage")
     kind = str(pick(rng, ("fit", "replay")))
     more = {"fit": ("--kind", "linear"), "replay": ("--model", "model.npz", "--steps", "1")}[kind]
 
     def check(status: int, out: bytes) -> list[str]:
+        if not right and abs(math.log(ratio)) < 0.1 and sign > 0:
+            return []
         shown = f"{kind} of {head} with {unit}, {sign}, {dt} s"
         if status == 2:
             return [f"refused: {shown}"] if right else []
