@@ -64,6 +64,28 @@ def test_a_unit_says_more_than_a_letter() -> None:
     assert chosen(**{"speed_ref|rad/s": surge, "speed|rad/s": plant(surge)}) == (["speed"], ["speed_ref"])
 
 
+SLOW, FAST = plant(STEPS, 0.05), plant(RNG.normal(size=N), 0.5, 0.0)
+LOGS = {
+    "noisy heaters": ({"T1": SLOW + 0.2 * NOISE, "T2": plant(SLOW - 20, 0.05), "Q1": STEPS, "Q2": STEPS[::-1]}, 2),
+    "tank": ({"h1|cm": SLOW, "q_in|L/min": STEPS}, 1),
+    "ship": ({"u|m/s": SLOW, "v|m/s": plant(STEPS), "r|rad/s": SLOW, "rudder|rad": FAST}, 3),
+    "car": ({"speed|m/s": SLOW, "yaw_rate|rad/s": SLOW, "steering_angle|rad": FAST, "throttle|%": STEPS}, 2),
+    "drone": ({**dict.fromkeys(("roll", "pitch", "yaw", "p", "q", "r"), SLOW), "m1": STEPS, "m2": STEPS}, 6),
+    "arm": ({**dict.fromkeys(("q1", "q2", "dq1", "dq2"), SLOW), "tau1": NOISE, "tau2": NOISE}, 4),
+    "reactor": ({"Ca": plant(STEPS), "T": SLOW, "Tc": STEPS}, 2),
+    "cooled": ({"T|K": SLOW, "T_cool|K": STEPS}, 1),
+    "room": ({"T_room|degC": SLOW, "T_out|degC": np.sin(np.arange(N) / 50), "heating_power|W": STEPS}, 2),
+    "commanded speed": ({"position|m": SLOW, "speed|m/s": plant(STEPS), "speed_cmd|m/s": STEPS}, 2),
+}
+
+
+@pytest.mark.parametrize("kind", LOGS)
+def test_usual_logs_of_plants_and_robots(kind: str) -> None:
+    columns, count = LOGS[kind]
+    names = [name.partition("|")[0] for name in columns]
+    assert chosen(**columns) == (names[:count], names[count:])
+
+
 def test_an_index_and_a_second_clock_are_neither_and_a_temperature_beside_motion_is_not_used() -> None:
     k = np.arange(N)
     found = chosen(n=k, Zeit=0.5 * k + 7.0, position=plant(NOISE, 0.05), force=NOISE, temp=plant(STEPS))

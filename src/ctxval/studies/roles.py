@@ -19,7 +19,9 @@ from ctxval.data import Signal
 from ctxval.data.rates import Column, words_of
 
 # Words in names: of commands, of actuators, of measurements, of states, and of fields that are neither.
-_COMMANDS = "cmd command commands commanded action actions ref reference target goal setpoint desired ctrl pwm duty"
+_COMMANDS = (
+    "cmd command commands commanded action actions ref reference target goal set setpoint sp desired ctrl pwm duty"
+)
 _ACTUATORS = (
     "u input inputs tau torque force voltage volt volts throttle steer steering brake effort control valve thrust "
     "enable heater heating cooling pump fan rudder elevator aileron"
@@ -36,7 +38,9 @@ _OTHERS = (
     "success run trial"
 )
 _COMMAND_UNITS = re.compile(r"[kmu]?(N|Nm|N ?m|V|A|W)|%|pwm|duty", re.IGNORECASE)
-_STATE_UNITS = re.compile(r"[cmk]?m|m?rad|deg|°|rev|rpm|(°|deg ?)?[CKF]|m?bar|[kM]?Pa|m\^?3|[lL]|.+/(s|h|min)(\^?2)?")
+_STATE_UNITS = re.compile(
+    r"[cmk]?m|m?rad|deg|°|rev|rpm|(°|deg ?)?[CKF]|m?bar|[kM]?Pa|m\^?3|[lL]|([ckm]?m|m?rad|deg|°|rev)/(s|h|min)(\^?2)?"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +90,11 @@ class Evidence(ShortRepr):
         changes = np.concatenate([np.diff(each, axis=0) for each in values])
         span = np.ptp(np.concatenate(values), axis=0)
         jumps = np.abs(changes[changes.any(axis=1)]) / np.maximum(span, 1e-300)
-        return bool(len(jumps)) and len(jumps) < 0.5 * len(changes) and float(np.median(jumps.max(axis=1))) > 0.05
+        if not len(jumps) or len(jumps) >= 0.5 * len(changes):
+            return False
+        sizes = jumps.max(axis=1)
+        rounded = sizes.min() < 0.9 and float((sizes < 1.5 * sizes.min()).mean()) > 0.7  # steps of one digit
+        return not rounded and float(np.median(sizes)) > 0.05
 
     @property
     def hint(self) -> float:
@@ -99,10 +107,13 @@ class Evidence(ShortRepr):
         if unit:  # a rudder may be in degrees, but u in m/s is a speed
             of_state = -1.0 if acts and words != {"u"} else -3.0
             hint += 2.0 if _COMMAND_UNITS.fullmatch(unit) else of_state if _STATE_UNITS.fullmatch(unit) else 0.0
-        hint += 2.0 * acts
-        known = not words.isdisjoint([*_STATES.split(), *_THERMAL.split()]) or Column(self.path).order in (0, 1)
-        single = self.path.casefold() != "u" and len("".join(words - {*"0123456789"})) == 1
-        hint -= (0.5 if single else 1.5) * known
+        states = {word for word in words & {*_STATES.split(), *_THERMAL.split()} if len(word) > 1}
+        if acts:
+            hint += 2.5 if words.isdisjoint(states) else 2.0
+        elif states or Column(self.path).order == 1:
+            hint -= 1.5
+        elif len("".join(words - {*"0123456789"})) == 1:
+            hint -= 0.5
         return hint - 3.0 * (not words.isdisjoint(_MEASURED.split()) and hint <= 0)
 
     @property
@@ -128,18 +139,21 @@ class Evidence(ShortRepr):
 def roles(fields: Sequence[Evidence]) -> tuple[list[str], list[str]]:
     """Return the paths of the states and of the inputs among fields that change, in the order of the fields."""
     usable = [field for field in fields if not field.other and not field.counts]
-    scores = {field.path: field.hint + (2.0 if field.held else -0.5) for field in usable}
+    scores = {
+        field.path: field.hint + (-0.5 if not field.held else 3.5 if field.repeated > 0.9 else 2.0) for field in usable
+    }
     for path in leading(usable):
         if abs(scores[path]) < 1:  # of a field whose unit and name tell something, they count more
             scores[path] += 1.5
     inputs = [path for path, score in scores.items() if score > 0]
     left = [field for field in usable if field.path not in inputs]
-    moving = [field for field in left if field.hint < 0 and not field.process]
+    moving = [field for field in left if field.hint <= -1 and not field.process]
     if moving:
         left = [field for field in left if not field.thermal]
     shared = {Column(field.path).stem for field in moving} - {()}
-    hinted = [field for field in left if field.hint < 0 or Column(field.path).stem in shared]
-    return [field.path for field in hinted or left], inputs
+    hinted = [field for field in left if field.hint <= -1 or Column(field.path).stem in shared]
+    beside = [field for field in left if field.hint < 0] if hinted else left  # letters, such as p, q and r of a drone
+    return [field.path for field in left if field in hinted or field in beside], inputs
 
 
 def leading(fields: Sequence[Evidence]) -> list[str]:
@@ -149,7 +163,9 @@ def leading(fields: Sequence[Evidence]) -> list[str]:
     """
     single = [field for field in fields if field.signals[0].values.shape[1] == 1]
     counts = [len(signal.values) for signal in single[0].signals] if single else []
-    if len(single) < 2 or any([len(signal.values) for signal in field.signals] != counts for field in single):
+    if not 2 <= len(single) <= 16 or any(
+        [len(signal.values) for signal in field.signals] != counts for field in single
+    ):
         return []
     past, following = list[Array](), list[Array]()
     for number in range(len(counts)):
@@ -176,6 +192,6 @@ def leading(fields: Sequence[Evidence]) -> list[str]:
     for i in everything:
         rest = [k for k in everything if k != i]
         helps = max(1 - unexplained(k, everything) / unexplained(k, rest) for k in rest)
-        if helps > 0.3 and 1 - unexplained(i, everything) / unexplained(i, [i]) < 0.1:
+        if helps > 0.3 and unexplained(i, [i]) > 0.5 and 1 - unexplained(i, everything) / unexplained(i, [i]) < 0.1:
             found.append(single[i].path)
     return found
