@@ -176,9 +176,9 @@ def test_a_recording_of_another_run_with_the_same_start_is_remarked() -> None:
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (lambda t, x: (1e3 * t, x), "as if t were in ms"),
         (lambda t, x: (t, x * [180 / np.pi, 1]), "in deg and"),
         (lambda t, x: (t, x * [1, -1]), "wrong sign"),
+        (lambda t, x: (1e3 * t, x), "as if t were in ms"),  # and those of the task
         (lambda t, x: (t, x), ""),
     ],
 )
@@ -190,7 +190,7 @@ def test_a_recording_whose_times_units_or_signs_contradict_each_other_is_refused
     times, states = change(t, x)
     path = tmp_path / "run.csv"
     Trajectory(times, states, np.zeros((300, 1))).to_csv(path, states=["angle", "speed"], inputs=["torque"])
-    read = (path, {"angle": "rad", "speed": "rad/s"}, {"torque": "N m"}, t)
+    read = (path, {"angle": "rad", "speed": "rad/s"}, {"torque": "N m"}, times)
     if not why:
         assert SuppliedResult(path).read_file(*read).horizon == 300
         return

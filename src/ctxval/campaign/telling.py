@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.columns import CsvTable, sentinels, time_column
+from ctxval._util.columns import sentinels
 from ctxval._util.cores import MOST_MEMORY
 from ctxval._util.files import temporary_folder
 from ctxval.core.experiment import Experiment
@@ -81,7 +81,7 @@ class SuppliedResult:
             raise InputError(f"{path} must be one recording, got a batch of shape {recording.states.shape}.")
         if self.failed is None:
             _require_finite(path, recording, states, inputs)
-            _require_scale(path, recording, states, inputs)
+            _require_scale(path, recording, states, inputs, float(times[1] - times[0]))
         return self._resampled(recording, times)
 
     def _resampled(self, recording: Trajectory, times: Array) -> Trajectory:
@@ -139,15 +139,15 @@ def _require_finite(path: Path, recording: Trajectory, states: Names, inputs: Na
                 )
 
 
-def _require_scale(path: Path, recording: Trajectory, states: Names, inputs: Names) -> None:
+def _require_scale(path: Path, recording: Trajectory, states: Names, inputs: Names, dt: float) -> None:
     """Refuse a complete recording whose times, units or signs contradict each other, as every log is refused."""
     widths = recording.states.shape[-1], recording.inputs.shape[-1]
     if recording.ended != COMPLETE or recording.horizon < 2 or widths != (len(states), len(inputs)):
         return
     named = [Column(name, unit, of is inputs) for of in (states, inputs) for name, unit in of.items()]
-    time = time_column(str(path), CsvTable(path).names) if path.suffix == ".csv" else None
-    clock = Clocked.of(*(time or ("times", "")), "", stated=True)  # its steps are compared with those of the task
-    require_scale(str(path), [recording], named, float(np.median(np.diff(recording.times))), clock)
+    period = float(np.median(np.diff(recording.times)))
+    if np.isclose(period, dt, rtol=0.5):  # else its times are refused
+        require_scale(str(path), [recording], named, period, Clocked("t", confirmed=True))
 
 
 def require_file(path: Path) -> None:
