@@ -171,5 +171,6 @@ def test_times_that_the_rate_contradicts_are_refused_and_a_motion_that_returns_i
         np.savetxt(tmp_path / f"{name}.csv", rows, delimiter=",", header="t,angle,speed,voltage", comments="")
     with pytest.raises(InputError, match=r"as if t were in ms: a step would take 0\.02 s instead of 20 s"):
         survey([tmp_path / "ms.csv"])
-    found = survey([tmp_path / "s.csv"])
-    assert found.reach == (1, 119, 119)
+    for found in (survey([tmp_path / "s.csv"]), survey([tmp_path / "ms.csv"], time="t [ms]")):
+        assert found.reach == (1, 119, 119)
+        assert found.recordings.dt == pytest.approx(0.02)

@@ -146,7 +146,7 @@ def rate_pairs(runs: Sequence[Trajectory], columns: Sequence[Column], dt: float)
     """Return the states whose rates are recorded, the states first among the columns."""
     count, steps = sum(not column.of_input for column in columns), sum(run.horizon for run in runs)
     correlation, ratio, window = np.zeros((3, count, len(columns)))
-    parts = [(_steady(run.states), run.inputs) for run in runs]
+    parts = [_integrated(run) for run in runs]
     longest = max((run.horizon for run in runs), default=0)
     for length in (2**k for k in range(20) if 2**k <= longest // 2 and _WINDOWS * 2**k <= steps):
         changes, integrals = _windows(parts, length, max(1, steps // _MOST))
@@ -187,16 +187,20 @@ def _named_pairs(columns: Sequence[Column]) -> set[tuple[int, int]]:
     return named
 
 
+def _integrated(run: Trajectory) -> tuple[Array, Array]:
+    """Return the states of a run, and the sums of all states and inputs from its first step on."""
+    x = _steady(run.states)
+    rates = np.hstack([0.5 * (x[1:] + x[:-1]), run.inputs])
+    return x, np.vstack([np.zeros(rates.shape[1]), np.cumsum(rates, axis=0)])
+
+
 def _windows(parts: Sequence[tuple[Array, Array]], length: int, every: int) -> tuple[Array, Array]:
     """Return the changes of all states and the integrals of all states and inputs over windows of so many steps."""
     changes, integrals = list[Array](), list[Array]()
-    for x, u in parts:
-        first = np.arange(0, len(x) - length, min(every, length))
-        if len(first):
-            rates = np.hstack([0.5 * (x[1:] + x[:-1]), u])
-            sums = np.vstack([np.zeros(rates.shape[1]), np.cumsum(rates - rates.mean(axis=0), axis=0)])
-            changes.append(x[first + length] - x[first])
-            integrals.append(sums[first + length] - sums[first] + length * rates.mean(axis=0))
+    for x, sums in parts:
+        first = np.arange(0, len(x) - length, every)
+        changes.append(x[first + length] - x[first])
+        integrals.append(sums[first + length] - sums[first])
     return np.concatenate(changes), np.concatenate(integrals)
 
 

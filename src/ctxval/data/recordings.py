@@ -121,7 +121,9 @@ def recordings_of(
     clock = _clocked(logs[0], chosen)
     columns = [Column(channel.name, channel.unit, channel.of_input, channel.scaled) for channel in first]
     by_source = {run.source: [each.trajectory for each in runs if each.source == run.source] for run in runs[:100]}
-    for source, some in [*by_source.items(), ("all logs", [run.trajectory for run in runs])]:
+    if len(by_source) > 1:
+        by_source["all logs"] = [run.trajectory for run in runs]
+    for source, some in by_source.items():
         notes += require_scale(source, some, columns, dt, clock)
     whole = Recordings(tuple(runs), tuple(breaks), dt, states, inputs, (*how, *dict.fromkeys(notes)))
     return _with_lags(_with_observer(_with_derivatives(whole, chosen), chosen), chosen.lags)

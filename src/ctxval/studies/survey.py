@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ctxval._util.arrays import single_threaded
-from ctxval._util.columns import TIMES, named_unit, time_column
+from ctxval._util.columns import TIMES, column_of, named_unit, time_column
 from ctxval._util.describe import plain_json
 from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.texts import enumerated
@@ -110,13 +110,19 @@ class Survey(ShortRepr):
 
 
 def survey(
-    paths: Sequence[str | Path], mapping: LogMapping | None = None, *, dt: float | None = None, seed: int = 0
+    paths: Sequence[str | Path],
+    mapping: LogMapping | None = None,
+    *,
+    time: str | None = None,
+    dt: float | None = None,
+    seed: int = 0,
 ) -> Survey:
     """Return a first statement on the logs in files and folders.
 
     Args:
         paths: as in :func:`ctxval.data.read_recordings`; the logs have the same fields.
         mapping: which fields are states and inputs; guessed if it is None.
+        time: the column of the times, perhaps with a unit that it does not state, as ``t [ms]``; found if it is None.
         dt: length of a step in seconds, if the logs have no times or another one is wanted.
         seed: seed of the choice of recordings that are held out.
 
@@ -125,9 +131,9 @@ def survey(
     """
     logs, names = read_logs(paths), component_names(paths) if mapping is None else {}
     first, guesses = logs[0], list[str]()
-    clock = _clock(first, dt, guesses) if mapping is None else mapping.clock
-    time = _time_of(first, clock)
-    evidence = [_evidence(logs[:20], path, clock) for path in first.fields() if path != time]
+    clock = Clock(time) if time else _clock(first, dt, guesses) if mapping is None else mapping.clock
+    used = _time_of(first, clock)
+    evidence = [_evidence(logs[:20], path, clock) for path in first.fields() if path != used]
     summaries = [_summary(each) if isinstance(each, Evidence) else each for each in evidence]
     if mapping is None:
         moving = [each for each in evidence if isinstance(each, Evidence) and _summary(each).moves]
@@ -167,9 +173,10 @@ def survey(
 
 def _time_of(log: Log, clock: Clock) -> str | None:
     """Return the column of the times of a table; None if there is none."""
-    if clock.field is not None or not isinstance(log, Table):
+    if not isinstance(log, Table):
         return clock.field
-    column = time_column(log.source, log.fields())
+    about = log.source, log.fields()
+    column = time_column(*about) if clock.field is None else column_of(*about, clock.field)
     return None if column is None else column[0]
 
 
