@@ -92,8 +92,8 @@ class Clocked:
     def of(column: str, unit: str, mapped: str, *, stated: bool) -> Clocked:
         """Return the clock of a column with the unit of its name, or of the mapping; ``stated`` if a step is stated."""
         in_header, factor = bool(named_unit(column)[1]), _factor(unit or mapped or "s", "s")
-        known = next((name for name, seconds in _TIMES.items() if factor == seconds), "s")
-        return Clocked(column, known, in_header, stated or (bool(unit or mapped) and not in_header))
+        name = next((name for name, seconds in _TIMES.items() if factor == seconds), "s")
+        return Clocked(column, name, in_header, stated or (bool(unit or mapped) and not in_header))
 
     def advice(self, *units: str) -> str:
         """Return how to state that the times are in one of these units."""
@@ -215,7 +215,8 @@ def _steady(x: Array) -> Array:
         rows = np.maximum.accumulate(np.where(jumps, 0, np.arange(len(steps))[:, None]), axis=0)
         steps = np.take_along_axis(np.where(jumps, 0.0, steps), rows, axis=0)
         x = np.vstack([x[:1], x[0] + np.cumsum(steps, axis=0)])
-    return np.vstack([x[:1], np.median([x[:-2], x[1:-1], x[2:]], axis=0), x[-1:]])
+    low, high = np.minimum(x[:-2], x[1:-1]), np.maximum(x[:-2], x[1:-1])
+    return np.vstack([x[:1], np.maximum(low, np.minimum(high, x[2:])), x[-1:]])  # the median of three
 
 
 def require_scale(

@@ -133,8 +133,8 @@ def _clocked(log: Log, mapping: LogMapping) -> Clocked:
     """Return in which unit the times of a log are taken, and who states it."""
     if not isinstance(log, Table):
         return Clocked()  # messages have times in nanoseconds
-    found = (log.source, log.fields())
-    column = time_column(*found) if mapping.time is None else column_of(*found, mapping.time)
+    where = log.source, log.fields()
+    column = time_column(*where) if mapping.time is None else column_of(*where, mapping.time)
     return Clocked() if column is None else Clocked.of(*column, mapping.time_unit, stated=mapping.dt is not None)
 
 

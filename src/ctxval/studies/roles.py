@@ -152,8 +152,8 @@ def roles(fields: Sequence[Evidence]) -> tuple[list[str], list[str]]:
         left = [field for field in left if not field.thermal]
     shared = {Column(field.path).stem for field in moving} - {()}
     hinted = [field for field in left if field.hint <= -1 or Column(field.path).stem in shared]
-    beside = [field for field in left if field.hint < 0] if hinted else left  # letters, such as p, q and r of a drone
-    return [field.path for field in left if field in hinted or field in beside], inputs
+    letters = [field for field in left if field.hint < 0] if hinted else left  # letters, such as p, q and r of a drone
+    return [field.path for field in left if field in hinted or field in letters], inputs
 
 
 def leading(fields: Sequence[Evidence]) -> list[str]:
@@ -188,10 +188,10 @@ def leading(fields: Sequence[Evidence]) -> list[str]:
         return float(((Y[1::2, of] - X[1::2] @ weights) ** 2).mean()) + 1e-12
 
     everything = range(n)
-    found = list[str]()
+    leaders = list[str]()
     for i in everything:
         rest = [k for k in everything if k != i]
         helps = max(1 - unexplained(k, everything) / unexplained(k, rest) for k in rest)
         if helps > 0.3 and unexplained(i, [i]) > 0.5 and 1 - unexplained(i, everything) / unexplained(i, [i]) < 0.1:
-            found.append(single[i].path)
-    return found
+            leaders.append(single[i].path)
+    return leaders
