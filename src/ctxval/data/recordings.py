@@ -118,15 +118,18 @@ def recordings_of(
         how.append(f"inputs act {chosen.delay:g} s after they are logged")
     states = {channel.name: channel.unit for channel in first if not channel.of_input}
     inputs = {channel.name: channel.unit for channel in first if channel.of_input}
-    clock = _clocked(logs[0], chosen)
-    columns = [Column(channel.name, channel.unit, channel.of_input, channel.scaled) for channel in first]
-    by_source = {run.source: [each.trajectory for each in runs if each.source == run.source] for run in runs[:100]}
-    if len(by_source) > 1:
-        by_source["all logs"] = [run.trajectory for run in runs]
-    for source, some in by_source.items():
-        notes += require_scale(source, some, columns, dt, clock)
+    notes += _scale_notes(runs, first, dt, _clocked(logs[0], chosen))
     whole = Recordings(tuple(runs), tuple(breaks), dt, states, inputs, (*how, *dict.fromkeys(notes)))
     return _with_lags(_with_observer(_with_derivatives(whole, chosen), chosen), chosen.lags)
+
+
+def _scale_notes(runs: Sequence[Recording], channels: Sequence[Channel], dt: float, clock: Clocked) -> list[str]:
+    """Refuse times, units and signs that contradict each other in one log or in all; return what is unusual of them."""
+    columns = [Column(channel.name, channel.unit, channel.of_input, channel.scaled) for channel in channels]
+    groups = {run.source: [each.trajectory for each in runs if each.source == run.source] for run in runs[:100]}
+    if len(groups) > 1:
+        groups["all logs"] = [run.trajectory for run in runs]
+    return [note for source, some in groups.items() for note in require_scale(source, some, columns, dt, clock)]
 
 
 def _clocked(log: Log, mapping: LogMapping) -> Clocked:

@@ -131,7 +131,7 @@ def survey(
     """
     logs, names = read_logs(paths), component_names(paths) if mapping is None else {}
     first, guesses = logs[0], list[str]()
-    clock = Clock(time) if time else _clock(first, dt, guesses) if mapping is None else mapping.clock
+    clock = mapping.clock if mapping is not None else Clock(time) if time else _clock(first, dt, guesses)
     used = _time_of(first, clock)
     evidence = [_evidence(logs[:20], path, clock) for path in first.fields() if path != used]
     summaries = [_summary(each) if isinstance(each, Evidence) else each for each in evidence]

@@ -14,7 +14,7 @@ from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.checked import Must, require
 from ctxval._util.describe import plain_json
 from ctxval._util.representation import ShortRepr, counted
-from ctxval.core.model import Model, require_time_step
+from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.recordings import Recordings
 from ctxval.errors import InputError, ModelError, UnknownNameError
@@ -129,9 +129,7 @@ def fit(
         if step is None or not bounds:
             raise InputError("the kind 'parameters' needs a function (x, u, theta) -> x_next and the bounds of theta.")
         as_bounds(bounds)
-    if given is not None:
-        require_time_step(given, recordings.dt, "the recording")
-        recordings = in_units_of(given, recordings)
+    recordings = recordings if given is None else in_units_of(given, recordings)
     learned_from, held_out = split(recordings, hold_out, seed)
     data, _ = learned_from.transitions()
     fitted, failed = list[FittedModel](), list[FailedFit]()

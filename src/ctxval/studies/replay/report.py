@@ -14,7 +14,7 @@ from ctxval._util.checked import Must, require
 from ctxval._util.columns import unit_advice
 from ctxval._util.describe import plain_json
 from ctxval._util.representation import ShortRepr, counted, task_text
-from ctxval.core.model import Model, require_time_step
+from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
 from ctxval.data.recordings import Recordings
@@ -189,7 +189,6 @@ def replay(
                 f"the tasks have steps of {task.dt:g} s and the recordings have steps of {recordings.dt:g} s: "
                 f"{unit_advice(recordings.dt, task.dt) or f'give dt = {task.dt:g} in the mapping of the recordings'}."
             )
-    require_time_step(model, recordings.dt, "the recording")
     recordings = in_units_of(model, recordings)
     new = unseen(model, recordings)
     used = new or list(range(len(recordings.runs)))

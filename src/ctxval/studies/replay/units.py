@@ -10,7 +10,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.texts import enumerated
 from ctxval.core.labels import factors_between, labels_of, units_of
-from ctxval.core.model import Model
+from ctxval.core.model import Model, require_time_step
 from ctxval.core.trajectory import Trajectory
 from ctxval.data.recordings import Recordings
 from ctxval.errors import InputError
@@ -23,9 +23,10 @@ def in_units_of(model: Model, recordings: Recordings) -> Recordings:
     """Return recordings in the order and the units of the states and inputs that a model states.
 
     Raises:
-        InputError: if two units cannot be converted, or if units are not stated and the errors of the model show that
-            they differ: another unit makes them small.
+        InputError: if the model has another time step, if two units cannot be converted, or if units are not stated and
+            the errors of the model show that they differ: another unit makes them small.
     """
+    require_time_step(model, recordings.dt, "the recording")
     named, notes = list[dict[str, str]](), list(recordings.notes)
     places, factors, unknown = list[list[int]](), list[Array](), list[bool]()
     for known, recorded in zip(units_of(model), (recordings.states, recordings.inputs), strict=True):
