@@ -34,7 +34,19 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
 from ctxval._util.json_lines import JsonLines  # noqa: E402
-from hostile import archives, arguments, clothes, doors, experiments, logs, numbers, oracles, served, stores  # noqa: E402
+from hostile import (  # noqa: E402
+    archives,
+    arguments,
+    clocks,
+    clothes,
+    doors,
+    experiments,
+    logs,
+    numbers,
+    oracles,
+    served,
+    stores,
+)
 from hostile.cage import SENTINEL, STATUSES, Case, Outcome, Watched, carry_out, declared  # noqa: E402
 from hostile.values import Rng, pick  # noqa: E402
 
@@ -258,6 +270,7 @@ FAMILIES: dict[str, Family] = {
     "systems": Family("systems", 0.01, _system),
     "clothes": Family("the same recordings in other formats, columns and units", 0.12, clothes.case, own=True),
     "logs": Family("logs of all kinds, and models, for `replay`, `fit`, `tell` and `import`", 0.1, logs.case, own=True),
+    "clocks": Family("times, units and signs that are not what a header says", 0.05, clocks.case, own=True),
     "outputs": Family("outputs onto inputs, and other files", 0.03, doors.outputs, own=True),
     "secrets": Family("systems that use secrets", 0.02, doors.secret_system, own=True),
     "served": Family("requests to `ctxval serve`", 0.02, served.case, own=True, each=served.REQUESTS),

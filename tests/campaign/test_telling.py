@@ -182,3 +182,30 @@ def test_inputs_at_old_states_are_remarked_with_their_age(steps: int) -> None:
     controller, validation = SeeingLate(opened.plan.controller, steps), campaign.validation
     told = campaign.tell(opened, validation.system.execute(controller, opened.plan.task))
     assert f"at states that are {counted(steps, 'step')} old" in str(campaign.input_difference(told))
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda t, x: (t, x * [180 / np.pi, 1]), "in deg and"),
+        (lambda t, x: (t, x * [1, -1]), "wrong sign"),
+        (lambda t, x: (1e3 * t, x), "as if t were in ms"),  # and those of the task
+        (lambda t, x: (t, x), ""),
+    ],
+)
+def test_a_recording_whose_times_units_or_signs_contradict_each_other_is_refused(
+    change: Any, why: str, tmp_path: Path
+) -> None:
+    t = 0.02 * np.arange(301)
+    x = np.stack([np.sin(3 * t) + 0.2 * np.sin(11 * t), 3 * np.cos(3 * t) + 2.2 * np.cos(11 * t)], axis=-1)
+    times, states = change(t, x)
+    path = tmp_path / "run.csv"
+    Trajectory(times, states, np.zeros((300, 1))).to_csv(path, states=["angle", "speed"], inputs=["torque"])
+    read = (path, {"angle": "rad", "speed": "rad/s"}, {"torque": "N m"}, times)
+    if not why:
+        assert SuppliedResult(path).read_file(*read).horizon == 300
+        return
+    with pytest.raises(InputError, match=why):
+        SuppliedResult(path).read_file(*read)
+    failed = SuppliedResult(path, failed="it fell")  # whatever a failed execution has recorded is kept
+    assert failed.read_file(*read).horizon == 300

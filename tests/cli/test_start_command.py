@@ -36,7 +36,7 @@ def test_logs_lead_to_a_statement_and_to_files_that_work(logs: Path, tmp_path: P
     done = call("start", str(logs), "--out", str(out))
     assert done.exit_code == 0, done.output
     text = " ".join(done.output.split())
-    assert "guessed: the names of the fields tell what they are taken as" in text
+    assert "guessed: the records, units and names of the fields tell what they are taken as" in text
     assert "The linear model errs by less than 10 % of the recorded change" in text
     mapping = LogMapping.from_toml(out / "mapping.toml")
     assert list(read_recordings([logs], mapping).states) == ["position", "speed"]

@@ -290,3 +290,32 @@ def test_only_valid_rows_count() -> None:
         recorded({"t": times, "x": times, "u": times}, valid="status")
     with pytest.raises(InputError, match="log has no field 'state'"):
         recorded({"t": times, "x": times, "u": times}, valid="state == 0")
+
+
+@pytest.mark.parametrize(("state", "command"), [(0.004, 0.1), (0.02, 0.24), (0.01, 0.003)])
+def test_rows_of_a_joined_table_without_a_state_do_not_count_in_its_period(state: float, command: float) -> None:
+    t, late = state * np.arange(300), 0.0006 + command * np.arange(int(300 * state / command))
+    times = np.sort(np.concatenate([t, late]))
+    x = np.where(np.isin(times, t), np.sin(times), np.nan)
+    u = np.where(np.isin(times, late), times, np.nan)
+    found = recorded({"t": times, "x": x, "u": u})
+    assert found.dt == state
+    assert not found.breaks
+    assert found.steps > 0.9 * 300 - command / state
+    one = found.runs[0]
+    np.testing.assert_allclose(one.trajectory.states[:, 0], np.sin(one.start + one.trajectory.times), atol=1e-4)
+
+
+RHYTHMS = {
+    "jitter": lambda t, rng: t + rng.uniform(-0.008, 0.008, len(t)),
+    "skewed jitter": lambda t, rng: np.sort(t + rng.exponential(0.002, len(t))),
+    "pairs": lambda t, rng: np.sort(np.where(np.arange(len(t)) % 2, t - 0.019, t)),
+    "lost": lambda t, rng: t[np.sort(rng.permutation(len(t))[: int(0.9 * len(t))])],
+    "jitter and lost": lambda t, rng: (t + rng.uniform(-0.004, 0.004, len(t)))[rng.random(len(t)) > 0.1],
+}
+
+
+@pytest.mark.parametrize("kind", RHYTHMS)
+def test_the_period_is_that_of_the_sensor_whatever_the_logger_does(kind: str) -> None:
+    t = RHYTHMS[kind](0.02 * np.arange(500), np.random.default_rng(0))
+    assert recorded({"t": t, "x": t, "u": t}).dt == pytest.approx(0.02, rel=0.01)

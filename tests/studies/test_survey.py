@@ -137,3 +137,40 @@ def test_logs_without_a_state_are_refused(tmp_path: Path) -> None:
         survey([tmp_path / "still.csv"])
     with pytest.raises(InputError, match="there is no file"):
         survey([tmp_path / "none.csv"])
+
+
+def noisy_oven(path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x, rows = 20.0, list[str]()
+    for k, h in enumerate(np.repeat(rng.uniform(0, 100, 8), 50)):
+        rows.append(f"{k},{x + 0.05 * rng.normal():.4f},{h:.3f}")
+        x += -0.01 * (x - 20) + 0.005 * h
+    path.write_text("time,temperature,heater_cmd\n" + "\n".join(rows) + "\n")
+
+
+def test_a_slow_plant_is_judged_over_more_steps_than_those_in_which_noise_hides_the_motion(tmp_path: Path) -> None:
+    for seed in range(3):
+        noisy_oven(tmp_path / f"{seed}.csv", seed)
+    found = survey([tmp_path])
+    first, close, compared = found.reach
+    assert (list(found.recordings.states), list(found.recordings.inputs)) == (["temperature"], ["heater_cmd"])
+    assert 1 < first < 30
+    assert close == compared == 399
+    assert f"over less than {first} steps, noise hides the motion" in found.statement
+    assert found.best.useless is None
+
+
+def test_times_that_the_rate_contradicts_are_refused_and_a_motion_that_returns_is_judged_by_its_size(
+    tmp_path: Path,
+) -> None:
+    t = 0.02 * np.arange(600)
+    x, v = np.sin(2 * np.pi * t), 2 * np.pi * np.cos(2 * np.pi * t)  # every 50 steps, it is where it was
+    u = np.repeat(np.random.default_rng(0).uniform(-1, 1, 60), 10)
+    for name, times in (("ms", 1e3 * t), ("s", t)):
+        rows = np.column_stack([times, x, v, u])
+        np.savetxt(tmp_path / f"{name}.csv", rows, delimiter=",", header="t,angle,speed,voltage", comments="")
+    with pytest.raises(InputError, match=r"as if t were in ms: a step would take 0\.02 s instead of 20 s"):
+        survey([tmp_path / "ms.csv"])
+    for found in (survey([tmp_path / "s.csv"]), survey([tmp_path / "ms.csv"], time="t [ms]")):
+        assert found.reach == (1, 119, 119)
+        assert found.recordings.dt == pytest.approx(0.02)

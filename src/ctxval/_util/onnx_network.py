@@ -71,6 +71,11 @@ class OnnxNetwork(ShortRepr):
             raise InputError(f"the network must take any number of rows or one row, got {max(fixed)} rows.")
         self.precision = max(float(np.finfo(port.kind).eps) for port in ports)
 
+    @property
+    def notes(self) -> dict[str, str]:
+        """The texts that the file keeps beside the network, by their names."""
+        return dict(self._session.get_modelmeta().custom_metadata_map)
+
     def describe(self) -> dict[str, Any]:
         return {"onnx": self._digest}
 
@@ -192,8 +197,15 @@ class GraphValue:
         squares = (self * self).affine(np.repeat(inverse[:, None], len(centres), axis=1), np.zeros(len(centres)))
         return (mixed + squares).node("Relu")
 
-    def write(self, path: str | Path, title: str, width: int, outputs: dict[str, tuple[Self, str, list[Any]]]) -> Path:
-        """Write the graph whose input this is, rows of so many numbers, to an ONNX file.
+    def write(
+        self,
+        path: str | Path,
+        title: str,
+        width: int,
+        outputs: dict[str, tuple[Self, str, list[Any]]],
+        notes: dict[str, str] | None = None,
+    ) -> Path:
+        """Write the graph whose input this is, rows of so many numbers, to an ONNX file, with texts by their names.
 
         The outputs are values by name, with their type (``DOUBLE`` or ``BOOL``) and shape; ``"N"`` stands for rows.
         """
@@ -206,6 +218,7 @@ class GraphValue:
         # Versions that onnxruntime has read since 2022.
         opset = [helper.make_opsetid("", 17)]
         content = helper.make_model(graph, opset_imports=opset, ir_version=8, producer_name=MADE_BY)
+        helper.set_model_props(content, notes or {})
         make_folder_of(path)
         with written_whole(path) as file:
             file.write(content.SerializeToString())

@@ -21,6 +21,7 @@ from ctxval.core.labels import labels_of
 from ctxval.core.plan import Plan
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.data import LogMapping, is_log, read_recordings
+from ctxval.data.rates import Clocked, Column, require_scale
 from ctxval.errors import ExecutionError, InputError
 from ctxval.systems.subprocess import run_supervised
 
@@ -80,6 +81,7 @@ class SuppliedResult:
             raise InputError(f"{path} must be one recording, got a batch of shape {recording.states.shape}.")
         if self.failed is None:
             _require_finite(path, recording, states, inputs)
+            _require_scale(path, recording, states, inputs, float(times[1] - times[0]))
         return self._resampled(recording, times)
 
     def _resampled(self, recording: Trajectory, times: Array) -> Trajectory:
@@ -135,6 +137,17 @@ def _require_finite(path: Path, recording: Trajectory, states: Names, inputs: Na
                     f"{path}: {name} is {marks[0]:g} at {at:g} s, far from all other values, which stands "
                     f"for a missing one. {advice}"
                 )
+
+
+def _require_scale(path: Path, recording: Trajectory, states: Names, inputs: Names, dt: float) -> None:
+    """Refuse a complete recording whose times, units or signs contradict each other, as every log is refused."""
+    widths = recording.states.shape[-1], recording.inputs.shape[-1]
+    if recording.ended != COMPLETE or recording.horizon < 2 or widths != (len(states), len(inputs)):
+        return
+    named = [Column(name, unit, of is inputs) for of in (states, inputs) for name, unit in of.items()]
+    period = float(np.median(np.diff(recording.times)))
+    if np.isclose(period, dt, rtol=0.5):  # else its times are refused
+        require_scale(str(path), [recording], named, period, Clocked("t", confirmed=True))
 
 
 def require_file(path: Path) -> None:

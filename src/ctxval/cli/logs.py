@@ -169,7 +169,7 @@ def start(logs: list[Path], reading: Logs, out_: Path = Path("start"), force: bo
     files = {name: out_ / name for name in ("mapping.toml", "model.npz", "experiment.toml", "report.html")}
     require_outputs({f"--out {name}": path for name, path in files.items()}, [*logs, reading.mapping], force=force)
     stated = reading.stated()
-    result = survey(logs, stated, dt=reading.dt, seed=seed)
+    result = survey(logs, stated, time=reading.time, dt=reading.dt, seed=seed)
     _print_survey(result)
     write_text(files["mapping.toml"], mapping_text(result.mapping, result.recordings.dt))
     write_model(files["model.npz"], result.best.model)

@@ -33,6 +33,7 @@ from ctxval.studies.fitting.model_file import BESIDE, SUFFIXES, require_suffix, 
 from ctxval.studies.replay import PredictedTask, ReplayReport
 from ctxval.studies.replay import replay as compared
 from ctxval.studies.replay.report import STEPS as REPLAYED
+from ctxval.studies.replay.report import RecordedData
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,7 @@ def replay(
     validation = None if loaded is None else loaded.validation.with_parts(model=chosen)
     report = compared(chosen, recordings, steps=wanted, validation=validation, executions=executions, seed=seed)
     units = "" if loaded is None else loaded.units
-    _print_replay(report, recordings, units)
+    _print_replay(report, units)
     if html is None:
         return report.to_json()
     written = write_replay_page(report, html, name=name, units=units)
@@ -160,11 +161,11 @@ def replay(
     return {**report.to_json(), "report": str(written)}
 
 
-def _print_replay(report: ReplayReport, recordings: Recordings, units: str) -> None:
+def _print_replay(report: ReplayReport, units: str) -> None:
     data = report.data
     out.say(f"{data.recordings} recordings, {data.steps} steps of {data.dt:g} s ({data.steps * data.dt:.4g} s)")
     out.say(f"states: {', '.join(data.states)}; inputs: {', '.join(data.inputs) or 'none'}")
-    print_breaks(recordings)
+    print_breaks(report.data)
     errors = sorted(report.errors, key=lambda error: list(data.states).index(error.state))
     rows = [(*error_cells(each), f"{each.lowest:.3g} to {each.highest:.3g}", f"{each.upper:.3g}") for each in errors]
     columns = ["state", "steps", "rms error", "of the change", "of recordings", "95 % below"]
@@ -336,7 +337,7 @@ def numbers(text: str) -> list[int]:
     return [int(part) for part in parts]
 
 
-def print_breaks(recordings: Recordings) -> None:
+def print_breaks(recordings: Recordings | RecordedData) -> None:
     for note in recordings.notes:
         out.say((note, "dim"))
     for split in recordings.breaks[:5]:

@@ -14,7 +14,7 @@ from ctxval._util.checked import PositiveFloat, PositiveInt, checked
 from ctxval._util.columns import differ
 from ctxval._util.representation import call, lines
 from ctxval._util.texts import parted
-from ctxval.core.labels import Labels, names_of
+from ctxval.core.labels import Labels, names_of, require_same_units, units_of
 from ctxval.core.truth import Truth
 from ctxval.core.validation import Validation
 
@@ -49,6 +49,10 @@ class Experiment:
             object.__setattr__(self, name, getattr(labels, name))
         if labels != given:
             object.__setattr__(self, "validation", self.validation.with_parts(labels=labels))
+        for kind, known in zip(("states", "inputs"), units_of(self.validation.model), strict=True):
+            require_same_units(
+                f"the {kind} of the model", known, "the experiment", dict(map(parted, getattr(self, kind)))
+            )
         if (doubt := self.doubt_of_units) is not None:
             warnings.warn(doubt, UnitsWarning, stacklevel=3)
 

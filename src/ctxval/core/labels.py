@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from ctxval._util.checked import checked
+from ctxval._util.columns import conversion
+from ctxval._util.refusals import reworded
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import parted, shortened
 from ctxval.errors import InputError
@@ -60,3 +62,35 @@ def names_of(system: object, kind: str) -> dict[str, str]:
     if isinstance(names, Mapping):
         return {str(name): str(unit) for name, unit in names.items()}
     return dict.fromkeys(map(str, names), "") if isinstance(names, list | tuple) else {}
+
+
+def units_of(model: object) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the names of the states and inputs of a model with their units, or those of the data it was learned from.
+
+    They are empty if they are not known.
+    """
+    data = getattr(model, "data", None)
+    states, inputs = (names_of(model, kind) or names_of(data, kind) for kind in ("states", "inputs"))
+    return states, inputs
+
+
+def factors_between(first: Mapping[str, str], second: Mapping[str, str]) -> list[float]:
+    """Return the factor from the unit of each first one to that of the second one in its place, 1 if one is unknown.
+
+    Raises:
+        InputError: if two units have no known factor, such as m and rad.
+    """
+    factors = list[float]()
+    for (name, recorded), wanted in zip(first.items(), second.values(), strict=True):
+        with reworded(name, InputError):
+            factors.append(conversion(recorded, wanted) if recorded and wanted else 1.0)
+    return factors
+
+
+def require_same_units(what: str, units: Mapping[str, str], whose: str, others: Mapping[str, str]) -> None:
+    """Refuse names with units of which one differs from the unit in its place of others."""
+    if len(units) != len(others):  # those of the one or the other are not known
+        return
+    for (name, unit), other, factor in zip(units.items(), others.values(), factors_between(units, others), strict=True):
+        if factor != 1:
+            raise InputError(f"{what} have {name} in {unit}, and {whose} in {other}: use one unit.")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from ctxval._util.files import MOST_BYTES, Archive, read_bytes, written_whole
 from ctxval._util.representation import ShortRepr, Shown, call, counted, number
 from ctxval._util.tables import CsvTable
 from ctxval._util.texts import enumerated, guarded, parted, visible
+from ctxval.core.labels import require_same_units
 from ctxval.errors import InputError, ShapeError
 
 COMPLETE = "complete"
@@ -37,7 +38,8 @@ TERMINATED, DIVERGED = "terminated", "diverged"
 class Transitions(ShortRepr):
     """Recorded steps of a system: in state x ``(N, n)``, the input u ``(N, m)`` led to x_next ``(N, n)``.
 
-    The length of a step, dt in seconds, is None if it is not known.
+    The length of a step, dt in seconds, is None if it is not known. The states and inputs may have names with units;
+    these are empty if they are not known.
     """
 
     x: Array
@@ -45,6 +47,8 @@ class Transitions(ShortRepr):
     x_next: Array
     dt: float | None = None
     memory: Array | None = None  #: the memory of M in each step ``(N, k)``, NaN if it is not known; None if M has none
+    states: Mapping[str, str] = field(default_factory=dict)
+    inputs: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("x", "u", "x_next"):
@@ -55,7 +59,7 @@ class Transitions(ShortRepr):
 
     def __getitem__(self, rows: slice | Rows | Mask) -> Transitions:
         memory = None if self.memory is None else self.memory[rows]
-        return Transitions(self.x[rows], self.u[rows], self.x_next[rows], memory=memory)
+        return replace(self, x=self.x[rows], u=self.u[rows], x_next=self.x_next[rows], memory=memory)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -73,7 +77,14 @@ class Transitions(ShortRepr):
         x, u, x_next = (np.concatenate([getattr(part, name) for part in parts]) for name in ("x", "u", "x_next"))
         width = max((part.memory.shape[1] for part in parts if part.memory is not None), default=0)
         memories = [np.full((len(part), width), np.nan) if part.memory is None else part.memory for part in parts]
-        return Transitions(x, u, x_next, steps[0] if steps else None, np.concatenate(memories) if width else None)
+        memory = np.concatenate(memories) if width else None
+        named = dict[str, Mapping[str, str]]()
+        for kind in ("states", "inputs"):
+            known = [getattr(part, kind) for part in parts if getattr(part, kind)]
+            for other in known[1:]:
+                require_same_units("recorded steps", known[0], "others", other)
+            named[kind] = known[0] if known else {}
+        return Transitions(x, u, x_next, steps[0] if steps else None, memory, **named)
 
 
 @dataclass(frozen=True, eq=False)

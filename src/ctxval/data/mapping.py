@@ -97,13 +97,13 @@ class LogMapping(ShortRepr):
     time: str | None = None  #: where the times come from, as in :class:`Clock`
     time_unit: str = ""
     stamp: Stamp = "auto"
-    #: length of a step in seconds; None for the median period of the first state. A table without times has one row for
+    #: length of a step in seconds; None for the mean period of the first state. A table without times has one row for
     #: each step.
     dt: float | None = None
     #: seconds between the time at which an input is logged and the time from which it acts on the states
     delay: float = 0.0
     #: longest time in seconds between two samples of one field over which it is interpolated or held; None for 1.5
-    #: median periods of the field. A recording is split at longer gaps and at missing values.
+    #: mean periods of the field. A recording is split at longer gaps and at missing values.
     longest_gap: float | None = None
     #: the number of earlier steps whose states and inputs are further states, if the records at one step do not
     #: determine the next ones

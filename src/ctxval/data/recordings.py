@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
-from ctxval._util.columns import FAR, conversion, sentinels, time_column, unit_advice
+from ctxval._util.columns import FAR, column_of, conversion, sentinels, time_column, unit_advice
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr, call, counted
@@ -22,6 +22,7 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.log import Log, Signal, Table
 from ctxval.data.mapping import LogMapping, Observer
+from ctxval.data.rates import Clocked, Column, require_scale
 from ctxval.data.readers import component_names, logs_in, read_logs
 from ctxval.data.sampling import Break, Channel, sampled
 from ctxval.errors import ExecutionError, InputError
@@ -57,7 +58,7 @@ class Recordings(ShortRepr):
         numbers = list(range(len(self.runs)) if runs is None else runs)
         parts = [self.runs[number].trajectory.transitions() for number in numbers]
         of = np.repeat(np.array(numbers, dtype=np.intp), [len(part) for part in parts])
-        return replace(Transitions.joined(parts), dt=self.dt), of
+        return replace(Transitions.joined(parts), dt=self.dt, states=self.states, inputs=self.inputs), of
 
 
 def read_recordings(
@@ -119,8 +120,27 @@ def recordings_of(
         how.append(f"inputs act {chosen.delay:g} s after they are logged")
     states = {channel.name: channel.unit for channel in first if not channel.of_input}
     inputs = {channel.name: channel.unit for channel in first if channel.of_input}
+    notes += _scale_notes(runs, first, dt, _clocked(logs[0], chosen))
     whole = Recordings(tuple(runs), tuple(breaks), dt, states, inputs, (*how, *dict.fromkeys(notes)))
     return _with_lags(_with_observer(_with_derivatives(whole, chosen), chosen), chosen.lags)
+
+
+def _scale_notes(runs: Sequence[Recording], channels: Sequence[Channel], dt: float, clock: Clocked) -> list[str]:
+    """Refuse times, units and signs that contradict each other in one log or in all; return what is unusual of them."""
+    columns = [Column(channel.name, channel.unit, channel.of_input, channel.scaled) for channel in channels]
+    groups = {run.source: [each.trajectory for each in runs if each.source == run.source] for run in runs[:100]}
+    if len(groups) > 1:
+        groups["all logs"] = [run.trajectory for run in runs]
+    return [note for source, some in groups.items() for note in require_scale(source, some, columns, dt, clock)]
+
+
+def _clocked(log: Log, mapping: LogMapping) -> Clocked:
+    """Return in which unit the times of a log are taken, and who states it."""
+    if not isinstance(log, Table):
+        return Clocked()  # messages have times in nanoseconds
+    where = log.source, log.fields()
+    column = time_column(*where) if mapping.time is None else column_of(*where, mapping.time)
+    return Clocked() if column is None else Clocked.of(*column, mapping.time_unit, stated=mapping.dt is not None)
 
 
 def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], notes: list[str]) -> list[Channel]:
@@ -150,7 +170,7 @@ def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], not
             _without_marks(f"{log.source}: {label}", column, scale, signal, notes)
             unit = field.unit or (signal.unit if field.factor is None else "")
             converted = scale * column + field.offset
-            about = field.angle, field.held, field.path, (signal.word, signal.first)
+            about = field.angle, field.held, field.path, (signal.word, signal.first), field.factor is not None
             channels.append(Channel(label, unit, name in mapping.inputs, signal.times, converted, *about))
     # In LeRobot data sets, states and actions have the same names.
     states = {channel.name for channel in channels if not channel.of_input}
@@ -182,16 +202,13 @@ def _in_unit_of(log: Log, channel: Channel, first: Channel) -> Channel:
 
 
 def _mean_period(log: Log, channel: Channel) -> float:
-    """Return the mean period, in which longer steps count as several ones."""
-    steps = np.diff(channel.times)
-    steps = steps[np.isfinite(steps) & (steps > 0)]
-    if not len(steps):
+    """Return the mean period of a channel, rounded if that does not move a sample."""
+    period, steps = channel.period, np.diff(channel.recorded)
+    if not period:
         raise InputError(f"{log.source} has fewer than two samples of {channel.path}, so its time step is unknown.")
-    counts = np.maximum(np.rint(steps / np.median(steps)), 1)
-    period = float(steps.sum() / counts.sum())
     rounded = float(f"{period:.6g}")
     # A rounded step must not drift away from the samples over the whole recording.
-    return rounded if abs(rounded - period) * counts.sum() < 1e-3 * period else period
+    return rounded if abs(rounded - period) * steps[steps > 0].sum() < 1e-3 * period**2 else period
 
 
 # States that are not recorded but follow from records: derivatives, and records of earlier steps

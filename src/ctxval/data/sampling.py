@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -45,13 +46,52 @@ class Channel(ShortRepr):
     held: bool = False  #: whether a value holds until the next one, however long that takes
     path: str = ""  #: its field in the log
     place: tuple[str, int] = ("row", 0)  #: what counts its samples in messages, and the number of the first one
+    scaled: bool = False  #: whether the user states its factor
+
+    @cached_property
+    def recorded(self) -> Array:
+        """The times of the samples that have a value: in a joined table, a row may hold another field alone."""
+        return np.asarray(self.times[np.isfinite(self.values)])
+
+    @cached_property
+    def rhythm(self) -> tuple[float, float]:
+        """The mean and the longest usual time between two samples, seconds, in which longer steps count as several."""
+        return _rhythm(self.recorded if len(self.recorded) > 1 else self.times)
 
     @property
     def period(self) -> float:
-        """The median time between two samples, seconds; 0 if there are fewer than two."""
-        steps = np.diff(self.times)
-        steps = steps[steps > 0]
-        return float(np.median(steps)) if len(steps) else 0.0
+        """The mean time between two samples, seconds; 0 if there are fewer than two."""
+        return self.rhythm[0]
+
+    @property
+    def longest(self) -> float:
+        """The longest time between two samples without a gap, seconds: 1.5 periods, or usual longer steps."""
+        return 1.5 * self.rhythm[1]
+
+
+def _rhythm(times: Array) -> tuple[float, float]:
+    """Return the mean period of times, and the longer of it and of the usual longer steps if their steps differ.
+
+    Times may come in bursts, or with a jitter that is not small against the period. So steps are counted in runs of as
+    few steps as differ in length by less than half a period, or else of as many as make the period least uncertain.
+    """
+    steps = np.diff(times)
+    steps = steps[steps > 0]
+    if not len(steps):
+        return 0.0, 0.0
+    ends, spreads = np.concatenate([[0.0], np.cumsum(steps)]), dict[tuple[int, float], float]()
+    for count in (1, 2, 3, 4, 5, 6, 8, 10, 16):
+        if count == 1 or len(steps) >= 4 * count:
+            low, middle, high = (np.quantile(ends[count:] - ends[:-count], [0.25, 0.5, 0.75]) / count).tolist()
+            spreads[count, middle] = high - low
+            if count * (high - low) < 0.4 * middle:
+                break
+    best, period = min(spreads, key=spreads.__getitem__)
+    starts = np.arange(0, len(steps), best * -(-8 // best))
+    runs, lengths = np.add.reduceat(steps, starts), np.diff(starts, append=len(steps))
+    for _ in range(4):  # a better period counts better
+        period = float(runs.sum() / np.maximum(np.rint(runs / period), lengths).sum())
+    return period, period if best == 1 else max(period, float(np.quantile(steps, 0.75)))
 
 
 def sampled(
@@ -120,17 +160,18 @@ def _intervals(source: str, channel: Channel, longest_gap: float | None, breaks:
         return [(float(times[good][0]), np.inf)]
     rows = np.flatnonzero(good)
     word, first = channel.place
-    # Each run of samples without a value between two with one; the input of the last row of a trajectory is not needed.
-    for before, after in ((int(rows[k]), int(rows[k + 1])) for k in np.flatnonzero(np.diff(rows) > 1)):
+    longest, kept = channel.longest if longest_gap is None else longest_gap, times[good]
+    # Each run of samples without a value between two with one, unless the rows between them hold other fields; the
+    # input of the last row of a trajectory is not needed.
+    missing = (np.diff(rows) > 1) & (np.diff(kept) > min(channel.longest, longest) * (1 + 1e-9))
+    for before, after in ((int(rows[k]), int(rows[k + 1])) for k in np.flatnonzero(missing)):
         where = f"{word} {first + before + 1}"
         if after - before > 2:
             where = f"{word}s {first + before + 1} to {first + after - 1}"
         gap = float(times[after] - times[before])
         breaks.append(Break(source, float(times[before]), gap, channel.name, f"has no value in {where}"))
-    longest = 1.5 * period if longest_gap is None else longest_gap  # median periods without a gap
-    kept = times[good]
-    cut = (np.diff(rows) > 1) | (np.diff(kept) > longest * (1 + 1e-9))
-    for k in np.flatnonzero(cut & (np.diff(rows) == 1)).tolist():
+    cut = missing | (np.diff(kept) > longest * (1 + 1e-9))
+    for k in np.flatnonzero(cut & ~missing).tolist():
         gap = float(kept[k + 1] - kept[k])
         breaks.append(Break(source, float(kept[k]), gap, channel.name, f"has no sample for {gap:.3g} s"))
     starts, ends = kept[np.append(True, cut)], kept[np.append(cut, True)]
@@ -154,7 +195,9 @@ def _intersection(first: list[Interval], second: list[Interval]) -> list[Interva
 def _part(
     source: str, channels: Sequence[Channel], start: float, end: float, dt: float
 ) -> tuple[float, Trajectory] | None:
-    samples = channels[0].times  # steps begin at samples of the first state, if its input is delayed by a part of one
+    samples = channels[
+        0
+    ].recorded  # steps begin at samples of the first state, if its input is delayed by a part of one
     later = samples[np.searchsorted(samples, start - _SLACK * dt) :][:1]
     if len(later) and 0 < later[0] - start < channels[0].period:
         start = float(later[0])

@@ -18,6 +18,7 @@ from ctxval._util.registry import part
 from ctxval.core.model import central_differences, paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ModelError, ShapeError
+from ctxval.models.saved import names_in
 
 
 @part(files=("source",))
@@ -38,6 +39,9 @@ class Onnx:
         self, source: str | Path | bytes, *, increments: bool = False, data: Transitions | None = None
     ) -> None:
         self.network, self.increments, self.data = OnnxNetwork(source), increments, data
+        with reworded("the ONNX file", InputError):
+            named = names_in(self.network.notes["ctxval"]) if "ctxval" in self.network.notes else {}
+        self.states, self.inputs = named.get("states", {}), named.get("inputs", {})
         if len(self.network.widths) not in (1, 2):
             names = ", ".join(self.network.names)
             raise InputError(f"a model must take (x, u) as one or two inputs, but the network has {names}.")

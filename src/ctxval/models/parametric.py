@@ -25,6 +25,7 @@ class Parametric:
         theta: the values of the parameters by name, in the order of theta.
         vectorized: True if ``step`` takes whole batches ``(..., n)`` and ``(..., m)``.
         dt: length of a step in seconds, if it is known.
+        states, inputs: the names of the states and inputs with their units, if they are known.
         data: the transitions that the parameters were learned from, if any.
     """
 
@@ -35,6 +36,8 @@ class Parametric:
         *,
         vectorized: bool = False,
         dt: float | None = None,
+        states: Mapping[str, str] | None = None,
+        inputs: Mapping[str, str] | None = None,
         data: Transitions | None = None,
     ) -> None:
         if not theta:
@@ -42,6 +45,7 @@ class Parametric:
         self.function = step
         self.theta = {str(name): float(as_finite(f"theta[{name}]", value)) for name, value in theta.items()}
         self.vectorized, self.dt, self.data = vectorized, dt, data
+        self.states, self.inputs = states or {}, inputs or {}
         values = np.array(list(self.theta.values()))
         self._step = Function(lambda x, u: step(x, u, values), vectorized=vectorized)
 

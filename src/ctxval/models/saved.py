@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.checked import require
 from ctxval._util.files import MADE_BY, Archive, read_bytes, written_whole
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
+from ctxval.core.labels import units_of
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
@@ -80,12 +82,28 @@ def stored_transitions(arrays: Archive) -> Transitions | None:
     if "x_next" not in arrays.names:
         return None
     x, u, x_next = (arrays.numbers(name) for name in _DATA)
-    return Transitions(x, u, x_next, float(arrays.numbers("dt")) if "dt" in arrays.names else None)
+    named = names_in(arrays.text("names")) if "names" in arrays.names else {}
+    return Transitions(x, u, x_next, float(arrays.numbers("dt")) if "dt" in arrays.names else None, **named)
+
+
+def names_as_text(data: object) -> str:
+    """Return the names of the states and inputs of a model, or of its data, with their units, as JSON."""
+    return json.dumps(dict(zip(("states", "inputs"), units_of(data), strict=True)))
+
+
+def names_in(text: str) -> dict[str, dict[str, str]]:
+    """Return the names of states and inputs with their units that a file of a model states."""
+    with reworded("the names of its states and inputs with their units cannot be read", ValueError, RecursionError):
+        content = json.loads(text)
+    for kind in ("states", "inputs"):
+        require(f"its {kind}", dict[str, str], content.get(kind) if isinstance(content, dict) else content)
+    return {kind: content[kind] for kind in ("states", "inputs")}
 
 
 def _data_arrays(data: Transitions) -> dict[str, Any]:
     step = {} if data.dt is None else {"dt": np.array(data.dt)}
-    return {name: getattr(data, name) for name in _DATA} | step
+    names = {"names": np.array(names_as_text(data))}
+    return {name: getattr(data, name) for name in _DATA} | step | (names if data.states or data.inputs else {})
 
 
 def _write(path: str | Path, arrays: dict[str, Any]) -> None:

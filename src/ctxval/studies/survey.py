@@ -16,39 +16,26 @@ from typing import Any, Literal
 import numpy as np
 
 from ctxval._util.arrays import single_threaded
-from ctxval._util.columns import TIMES, named_unit, time_column
+from ctxval._util.columns import TIMES, column_of, named_unit, time_column
 from ctxval._util.describe import plain_json
 from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.texts import enumerated
 from ctxval.core.model import Model
 from ctxval.data import Clock, Field, Log, LogMapping, Recordings, Table, component_names, read_logs, recordings_of
+from ctxval.data.rates import Column
 from ctxval.errors import InputError
 from ctxval.studies.fitting import FitReport, fit
 from ctxval.studies.fitting.fit import FittedModel
 from ctxval.studies.replay import ReplayReport, replay
 from ctxval.studies.replay.accuracy import step_errors
 from ctxval.studies.replay.report import unseen
+from ctxval.studies.roles import Evidence, roles
 
 Role = Literal["state", "input", ""]
 
 CLOSE = 0.1  # largest error, as a share of the recorded change, of a prediction that is called close
 
-_NEVER, _HARDLY = "it never changes", "it hardly changes"
-
-# Words in the names of fields by which their roles are guessed.
-_INPUTS = (
-    "u cmd command commands commanded input inputs action actions ref reference target goal setpoint desired tau "
-    "torque force voltage volt volts duty pwm throttle steer steering brake effort control ctrl valve thrust enable"
-)
-_OTHERS = (
-    "time t stamp timestamp sec nsec secs nanosec index frame episode seq id count counter status temp temperature "
-    "battery done reward success run trial"
-)
-_RATES = "rate rates speed vel velocity velocities omega dq qd gyro twist"
-_STATES = (
-    f"{_RATES} pos position positions angle theta phi psi q x y z yaw pitch roll heading level height altitude state "
-    "states displacement deflection encoder"
-)
+_NEVER, _HARDLY, _COUNTS = "it never changes", "it hardly changes", "it counts the records or the time"
 
 
 @dataclass(frozen=True)
@@ -64,6 +51,11 @@ class FieldSummary(ShortRepr):
     role: Role  #: whether it is taken as a state, as an input, or not at all
     remark: str  #: what is unusual, such as that it never changes
 
+    @property
+    def moves(self) -> bool:
+        """Whether its records change, and do not only count."""
+        return bool(self.records) and not self.remark.startswith((_NEVER, _HARDLY, _COUNTS))
+
 
 @dataclass(frozen=True, eq=False)
 class Survey(ShortRepr):
@@ -76,7 +68,8 @@ class Survey(ShortRepr):
     recordings: Recordings
     fit: FitReport  #: a linear model and one with what this leaves, each with its errors
     replay: ReplayReport  #: what the recordings show of the better one
-    reach: tuple[int, int]  #: number of steps for which its errors are close, and those that were compared
+    #: the numbers of steps from which and up to which its errors are close, 0 if none is, and the most compared
+    reach: tuple[int, int, int]
 
     @property
     def best(self) -> FittedModel:
@@ -86,14 +79,16 @@ class Survey(ShortRepr):
     @property
     def statement(self) -> str:
         """How far the better model predicts, and which tasks it suits, in one sentence."""
-        close, compared = self.reach
+        first, close, compared = self.reach
         dt, share = self.recordings.dt, f"{100 * CLOSE:g} % of the recorded change"
         model, far = f"the {self.best.kind} model", f"{counted(close, 'step')} ({close * dt:.3g} s)"
         if not close:
-            return f"{model} errs by more than {share} after one step of {dt:g} s already: it suits no task yet"
+            return f"{model} errs by more than {share} after each number of steps of {dt:g} s: it suits no task yet"
         suits = f"up to {far}, and by more after that: it suits tasks that end, or that feedback corrects, in less time"
         if close == compared:
             suits = f"at least {far}, as long as was compared: it suits tasks in the recorded range"
+        if first > 1:
+            suits += f"; over less than {first} steps, noise hides the motion"
         return f"{model} errs by less than {share} for {suits}"
 
     def to_json(self) -> dict[str, Any]:
@@ -106,21 +101,28 @@ class Survey(ShortRepr):
             "guesses": self.guesses,
             "fit": self.fit,
             "replay": self.replay,
-            "close": self.reach[0],
-            "compared": self.reach[1],
+            "close_from": self.reach[0],
+            "close": self.reach[1],
+            "compared": self.reach[2],
             "statement": self.statement,
         }
         return plain_json(values)
 
 
 def survey(
-    paths: Sequence[str | Path], mapping: LogMapping | None = None, *, dt: float | None = None, seed: int = 0
+    paths: Sequence[str | Path],
+    mapping: LogMapping | None = None,
+    *,
+    time: str | None = None,
+    dt: float | None = None,
+    seed: int = 0,
 ) -> Survey:
     """Return a first statement on the logs in files and folders.
 
     Args:
         paths: as in :func:`ctxval.data.read_recordings`; the logs have the same fields.
         mapping: which fields are states and inputs; guessed if it is None.
+        time: the column of the times, perhaps with a unit that it does not state, as ``t [ms]``; found if it is None.
         dt: length of a step in seconds, if the logs have no times or another one is wanted.
         seed: seed of the choice of recordings that are held out.
 
@@ -129,11 +131,15 @@ def survey(
     """
     logs, names = read_logs(paths), component_names(paths) if mapping is None else {}
     first, guesses = logs[0], list[str]()
-    clock = _clock(first, dt, guesses) if mapping is None else mapping.clock
-    times = (*TIMES, clock.field or "")
-    fields = [path for path in first.fields() if named_unit(path)[0].casefold() not in times and path != clock.field]
-    summaries = [_summary(logs[:20], path, clock) for path in fields]
-    chosen = replace(_guessed(first, summaries, clock, guesses), time=clock.field) if mapping is None else mapping
+    clock = mapping.clock if mapping is not None else Clock(time) if time else _clock(first, dt, guesses)
+    used = _time_of(first, clock)
+    evidence = [_evidence(logs[:20], path, clock) for path in first.fields() if path != used]
+    summaries = [_summary(each) if isinstance(each, Evidence) else each for each in evidence]
+    if mapping is None:
+        moving = [each for each in evidence if isinstance(each, Evidence) and _summary(each).moves]
+        chosen = replace(_guessed(first, summaries, moving, guesses), time=clock.field)
+    else:
+        chosen = mapping
     chosen = chosen if dt is None else replace(chosen, dt=dt)
     recordings = recordings_of(logs, chosen, names)
     if mapping is None and (turned := _turning(chosen, recordings)):
@@ -165,12 +171,26 @@ def survey(
     )
 
 
-def _summary(logs: Sequence[Log], path: str, clock: Clock) -> FieldSummary:
+def _time_of(log: Log, clock: Clock) -> str | None:
+    """Return the column of the times of a table; None if there is none."""
+    if not isinstance(log, Table):
+        return clock.field
+    about = log.source, log.fields()
+    column = time_column(*about) if clock.field is None else column_of(*about, clock.field)
+    return None if column is None else column[0]
+
+
+def _evidence(logs: Sequence[Log], path: str, clock: Clock) -> Evidence | FieldSummary:
     try:
         signals = [log.signals([path], clock)[path] for log in logs]
     except InputError as error:
         return FieldSummary(path, "", 0, 0.0, np.nan, np.nan, "", str(error))
-    unit, records = signals[0].unit, sum(len(signal.values) for signal in signals)
+    return Evidence(path, signals[0].unit, signals)
+
+
+def _summary(field: Evidence) -> FieldSummary:
+    path, unit, signals = field.path, field.unit, field.signals
+    records = sum(len(signal.values) for signal in signals)
     known = [signal.values[np.isfinite(signal.values).all(axis=1)] for signal in signals]
     values = np.concatenate(known)
     if not len(values):
@@ -178,14 +198,15 @@ def _summary(logs: Sequence[Log], path: str, clock: Clock) -> FieldSummary:
     steps = np.concatenate([np.diff(signal.times) for signal in signals])
     period = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     low, high = float(values.min()), float(values.max())
-    changing = np.concatenate([(np.diff(each, axis=0) != 0).any(axis=1) for each in known])
-    changes = float(changing.mean()) if len(changing) else 0.0
+    changes = 1 - field.repeated
     at_ends = max(float((values == end).all(axis=1).mean()) for end in (low, high))
     remark = ""
     if low == high:
         remark = _NEVER
     elif np.ptp(values, axis=0).max() <= 0.02 * max(abs(low), abs(high)):
         remark = _HARDLY
+    elif field.counts:
+        remark = _COUNTS
     elif changes == 0:
         remark = "it has one value in each file"
     elif len(np.unique(values)) == 2:
@@ -199,31 +220,13 @@ def _summary(logs: Sequence[Log], path: str, clock: Clock) -> FieldSummary:
     return FieldSummary(path, unit, len(values), period, low, high, "", remark)
 
 
-def _words(path: str) -> list[str]:
-    """Return the words in the name of a field, without its unit."""
-    name = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", named_unit(path)[0])
-    return re.findall("[a-z]+|[0-9]+", name.casefold())
-
-
-def _is(path: str, words: str) -> bool:
-    """Return whether the name of a field has one of some words."""
-    return not set(_words(path)).isdisjoint(words.split())
-
-
-def _guessed(log: Log, fields: Sequence[FieldSummary], clock: Clock, guesses: list[str]) -> LogMapping:
-    """Return the mapping by usual names, or by words in the names of fields; say how it was found."""
+def _guessed(log: Log, fields: Sequence[FieldSummary], moving: Sequence[Evidence], guesses: list[str]) -> LogMapping:
+    """Return the mapping by usual names, or by the records, units and names of fields; say how it was found."""
     with suppress(InputError):
         usual = LogMapping.usual(log)
         guesses.append(f"states and inputs have their usual names: {enumerated(usual.fields, 12)}")
         return usual
-    moving = [each for each in fields if each.records and not each.remark.startswith((_NEVER, _HARDLY))]
-    still = [each.path for each in fields if each not in moving]
-    inputs = [each.path for each in moving if _is(each.path, _INPUTS)]
-    others = [each.path for each in moving if each.path not in inputs and _is(each.path, _OTHERS)]
-    left = [each.path for each in moving if each.path not in (*inputs, *others)]
-    rates = _RATES.split()
-    moved = [[word for word in _words(path) if word not in rates] for path in left if _is(path, _RATES)]
-    states = [path for path in left if _is(path, _STATES) or _words(path) in moved] or left  # shoulder, shoulder_rate
+    states, inputs = roles(moving)
     if not states:
         raise InputError(
             f"{log.source} has no field that looks like a state; name the states and inputs with --state and --input. "
@@ -234,14 +237,20 @@ def _guessed(log: Log, fields: Sequence[FieldSummary], clock: Clock, guesses: li
     last = {path: re.split(r"[/.]", name)[-1].strip() or name for path, name in plain.items()}
     names = {path: name if [*last.values()].count(name) == 1 else plain[path] for path, name in last.items()}
     taken = f"states: {enumerated(states, 12)}; inputs: {enumerated(inputs, 12) or 'none'}"
-    guesses.append(f"the names of the fields tell what they are taken as; {taken}")
-    if unused := [*others, *still, *(path for path in left if path not in states)]:
+    guesses.append(f"the records, units and names of the fields tell what they are taken as; {taken}")
+    if unused := [each.path for each in fields if each.path not in (*states, *inputs)]:
         guesses.append(f"not used: {enumerated(unused, 12)}")
-    of_states = {names[path]: Field(path) for path in states}
-    single = [path for path in states if "[" in path or log.signals([path], clock)[path].values.shape[1] == 1]
-    if not any(_is(path, _RATES) for path in states) and single:
-        of_states |= {f"{names[path]} rate": Field(derivative_of=names[path]) for path in single}
+    of_states, known = {names[path]: Field(path) for path in states}, {each.path: each for each in moving}
+    orders = {path: Column(path, known[path].unit).order for path in states}
+    bare = [path for path in states if known[path].values.shape[1] == 1 and not known[path].process]
+    if bare and not {1, 2} & {*orders.values()}:
+        of_states |= {f"{names[path]} rate": Field(derivative_of=names[path]) for path in bare}
         guesses.append("no rate is recorded, so the derivatives of the states are states too")
+    for path in states:
+        if 0 < (share := known[path].repeated) > 0.5:
+            guesses.append(
+                f"{path} repeats its value in {100 * share:.0f} % of the records: it is rounded or held there"
+            )
     return LogMapping(of_states, {names[path]: Field(path) for path in inputs}, dt=log.period)
 
 
@@ -271,15 +280,25 @@ def _turning(mapping: LogMapping, recordings: Recordings) -> dict[str, Field]:
     return turned
 
 
-def _reach(model: Model, recordings: Recordings, whole: int) -> tuple[int, int]:
-    """Return for how many steps errors on recordings that were not learned from are close, and the most compared."""
+def _reach(model: Model, recordings: Recordings, whole: int) -> tuple[int, int, int]:
+    """Return from and up to which number of steps the model is close on recordings that it was not learned from.
+
+    The third number is the most steps that were compared. Over a few steps of a slow or often sampled system, the noise
+    of the records is larger than the motion, and tells nothing of the model over more steps.
+    """
     held = unseen(model, recordings) or range(len(recordings.runs))
     grid = sorted({min(whole, round(1.5**k)) for k in range(40) if 1.5**k <= 2 * whole} | {whole})
     with single_threaded():
         errors = step_errors(model, replace(recordings, runs=tuple(recordings.runs[number] for number in held)), grid)
-    close, most = 0, 0
-    for most in sorted({error.steps for error in errors}):
-        if any(not error.relative < CLOSE or error.diverged for error in errors if error.steps == most):
-            break
-        close = most
-    return close, most
+    scale, runs, before = dict[str, float](), [[0]], 0
+    for steps in sorted({error.steps for error in errors}):
+        after = [error for error in errors if error.steps == steps]
+        # A motion may come back to where it began, so an error is a share of the largest change up to then.
+        scale |= {error.state: max(error.change, scale.get(error.state, 0.0)) for error in after}
+        if all(error.rms < CLOSE * scale[error.state] and not error.diverged for error in after):
+            runs[-1].append(steps)
+        elif len(runs[-1]) > 1:
+            runs.append([0])
+        before = steps
+    longest = max(runs, key=len)[1:] or [0]
+    return longest[0], longest[-1], before

@@ -284,6 +284,13 @@ def test_a_model_is_learned_from_recorded_files(invoke: Any) -> None:
     for data in ("none.csv", "experiment_system.py", ["x.npz"], [], 3):
         with pytest.raises(InputError):
             recorded(data)
+    Path("ms.csv").write_text(
+        "\n".join(["t,position,speed,force", *(f"{50 * k},{p},{v},0" for k, (p, v) in enumerate(x))])
+    )
+    with pytest.raises(
+        InputError, match=r"with t in s, a step takes 50 s.* confirm it with dt = 50|as if t were in ms"
+    ):
+        recorded(["ms.csv"], None, names)
 
 
 # Any bytes

@@ -275,7 +275,7 @@ def test_numbers_of_steps_must_be_positive_integers(steps: list[Any]) -> None:
 def test_a_model_of_other_dimensions_is_refused_with_those_of_the_recordings() -> None:
     with pytest.raises(ModelError, match="which have 2 states and 1 inputs"):
         replay(models.Linear(np.eye(3), np.zeros((3, 1))), RECORDED)
-    with pytest.raises(ModelError, match=r"it returned the shape \(40000,\)|it returned the shape \(720,\)"):
+    with pytest.raises(ModelError, match=r"it returned the shape \(\d+,\)"):
         replay(models.Function(lambda x, u: x[..., 0], vectorized=True), RECORDED)
 
 

@@ -14,13 +14,14 @@ from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.checked import Must, require
 from ctxval._util.describe import plain_json
 from ctxval._util.representation import ShortRepr, counted
-from ctxval.core.model import Model, require_time_step
+from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.recordings import Recordings
 from ctxval.errors import InputError, ModelError, UnknownNameError
 from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.parametric import ParametricStep
-from ctxval.studies.replay.accuracy import StepError, step_errors, stepped
+from ctxval.studies.replay.accuracy import StepError, step_errors, stepped, useless
+from ctxval.studies.replay.units import in_units_of
 
 Kind = Literal["linear", "network", "gaussian-process", "parameters", "given"]
 KINDS: tuple[Kind, ...] = get_args(Kind)[:4]
@@ -62,9 +63,7 @@ class FittedModel(ShortRepr):
     @property
     def useless(self) -> str | None:
         """Why the model is no better than no model after one step, or after the largest number; None if it is."""
-        ends = [error for error in self.errors if error.steps in (1, self.steps)]
-        worst = max(ends, key=lambda error: error.relative, default=None)
-        if worst is None or worst.relative < 1:
+        if (worst := useless(self.errors)) is None:
             return None
         return (
             f"the {self.kind} model is no better than to predict no change: its held-out error of {worst.state} after "
@@ -130,6 +129,7 @@ def fit(
         if step is None or not bounds:
             raise InputError("the kind 'parameters' needs a function (x, u, theta) -> x_next and the bounds of theta.")
         as_bounds(bounds)
+    recordings = recordings if given is None else in_units_of(given, recordings)
     learned_from, held_out = split(recordings, hold_out, seed)
     data, _ = learned_from.transitions()
     fitted, failed = list[FittedModel](), list[FailedFit]()
@@ -141,7 +141,6 @@ def fit(
     with single_threaded():
         # Before anything is learned, because what is named must be usable.
         if given is not None:
-            require_time_step(given, recordings.dt, "the recording")
             add("given", given)
         for kind in dict.fromkeys(kinds):
             try:

@@ -5,6 +5,7 @@ An ONNX file has double precision, for robots and other programs; it needs onnx 
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,12 @@ import numpy as np
 
 from ctxval._util.files import MADE_BY, write_text
 from ctxval._util.onnx_network import GraphValue, require_onnx
+from ctxval.core.labels import units_of
 from ctxval.core.model import Model
 from ctxval.errors import InputError
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.corrected import before_refinement
-from ctxval.models.saved import write_model, write_transitions
+from ctxval.models.saved import names_as_text, write_model, write_transitions
 
 _ARRAYS = (Linear, FeedforwardReLU, GaussianProcessModel, Corrected)
 #: the models that a file of each suffix can hold
@@ -66,6 +68,11 @@ def write_model_file(path: Path, model: Model, step: str | None = None) -> list[
             f"theta = {{ {values} }}",
             *([] if dt is None else [f"dt = {dt!r}"]),
             *(["vectorized = true"] if model.vectorized else []),
+            *(
+                f"{kind} = {_table(named)}"
+                for kind, named in zip(("states", "inputs"), units_of(model), strict=True)
+                if named
+            ),
         ]
         return [str(write_text(path, "\n".join([*lines, ""])))]
     if path.suffix == ".npz":
@@ -79,12 +86,18 @@ def write_model_file(path: Path, model: Model, step: str | None = None) -> list[
     return [str(path), str(beside)]
 
 
+def _table(named: dict[str, str]) -> str:
+    """Return names with their units as a table of TOML."""
+    return f"{{ {', '.join(f'{json.dumps(name)} = {json.dumps(unit)}' for name, unit in named.items())} }}"
+
+
 def write_onnx(path: str | Path, model: Model) -> None:
     """Write a model as an ONNX file with one input ``(x, u)`` and the output ``x_next``."""
     _require_onnx(model)
     z = GraphValue.first("z")
     following, n, m = _next_state(z, model)
-    z.write(path, "step", n + m, {"x_next": (following, "DOUBLE", ["N", n])})
+    notes = {"ctxval": names_as_text(model)}
+    z.write(path, "step", n + m, {"x_next": (following, "DOUBLE", ["N", n])}, notes)
 
 
 def _require_onnx(model: Model | None) -> None:

@@ -44,6 +44,23 @@ class StepError(ShortRepr):
         return {**vars(self), "relative": self.relative}
 
 
+def useless(errors: Sequence[StepError]) -> StepError | None:
+    """Return the largest error that is no smaller than the recorded change, after one step or the most; None if none.
+
+    An error after one step that hardly grows with the steps, and is small against the change over them, is no fault of
+    the model: over a step of a slow or often sampled system, noise may be larger than the motion.
+    """
+    most = max((error.steps for error in errors), default=0)
+    last = {error.state: error for error in errors if error.steps == most}
+
+    def is_noise(error: StepError) -> bool:
+        end = last[error.state]
+        return error is not end and end.rms < 2 * error.rms and error.rms < 0.3 * end.change
+
+    ends = [each for each in errors if each.steps in (1, most) and each.relative >= 1 and not is_noise(each)]
+    return max(ends, key=lambda error: error.relative, default=None)
+
+
 @dataclass(frozen=True)
 class RegionalError(ShortRepr):
     """The one-step error in a range of one state or input, with so many recorded steps."""

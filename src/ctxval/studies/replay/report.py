@@ -14,7 +14,7 @@ from ctxval._util.checked import Must, require
 from ctxval._util.columns import unit_advice
 from ctxval._util.describe import plain_json
 from ctxval._util.representation import ShortRepr, counted, task_text
-from ctxval.core.model import Model, require_time_step
+from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
 from ctxval.data.recordings import Recordings
@@ -23,8 +23,9 @@ from ctxval.errors import InputError
 from ctxval.learning import DynamicsStudy
 from ctxval.learning.closed_loops import loop_pairs
 from ctxval.studies.replay import causes
-from ctxval.studies.replay.accuracy import RegionalError, StepError, regions, step_errors
+from ctxval.studies.replay.accuracy import RegionalError, StepError, regions, step_errors, useless
 from ctxval.studies.replay.causes import Fault, ResidualShare, Suggestion
+from ctxval.studies.replay.units import in_units_of
 
 STEPS = (1, 5, 20, 100)  #: numbers of steps after which errors are computed, unless others are given
 
@@ -188,7 +189,7 @@ def replay(
                 f"the tasks have steps of {task.dt:g} s and the recordings have steps of {recordings.dt:g} s: "
                 f"{unit_advice(recordings.dt, task.dt) or f'give dt = {task.dt:g} in the mapping of the recordings'}."
             )
-    require_time_step(model, recordings.dt, "the recording")
+    recordings = in_units_of(model, recordings)
     new = unseen(model, recordings)
     used = new or list(range(len(recordings.runs)))
     recorded = replace(recordings, runs=tuple(recordings.runs[number] for number in used))
@@ -252,11 +253,11 @@ def _insights(report: ReplayReport, used: int) -> Iterator[str]:
     if not single:
         yield "no recording has a single step, so nothing can be compared"
         return
-    worst = max(single, key=lambda error: error.relative)
-    if worst.relative >= 1:
+    worst, fault = max(single, key=lambda error: error.relative), useless(errors)
+    if fault is not None and fault.steps == 1:
         yield (
-            f"the model predicts {worst.state} no better than no change at all: its one-step error is "
-            f"{100 * worst.relative:.0f} % of the recorded change"
+            f"the model predicts {fault.state} no better than no change at all: its one-step error is "
+            f"{100 * fault.relative:.0f} % of the recorded change"
         )
     steps = max(error.steps for error in errors)
     late = ", ".join(error.state for error in errors if error.steps == steps and error.relative >= 1)
