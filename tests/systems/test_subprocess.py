@@ -169,12 +169,12 @@ def test_a_rig_has_time_to_stop_and_its_recording_is_kept(tmp_path: Path) -> Non
     assert trajectory.ended == "the command did not end within 0.5 s and was stopped"
     space = TaskSpace(speed=(-0.6, -0.5))
     validation = Validation(
-        space,
-        lambda p: Task(np.stack([np.ones_like(p.speed), p.speed], -1), goal=[0.2, 0.0], horizon=20, dt=0.1),
-        system,
-        MODEL,
-        controllers.LQR([10.0, 1.0], [0.1]),
-        distances.FinalState(),
+        space=space,
+        task=lambda p: Task(np.stack([np.ones_like(p.speed), p.speed], -1), goal=[0.2, 0.0], horizon=20, dt=0.1),
+        system=system,
+        model=MODEL,
+        synthesizer=controllers.LQR([10.0, 1.0], [0.1]),
+        distance=distances.FinalState(),
     )
     campaign = Campaign(validation, seed=0).run(1)
     (trial,) = campaign.failed

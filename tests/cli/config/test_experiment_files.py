@@ -136,11 +136,11 @@ def test_init_for_hardware_executes_the_program_that_it_writes(invoke: Any) -> N
 @pytest.mark.parametrize(
     ("old", "new", "reason", "steps"),
     [
-        ("> 10.0", "> 0.06", "at step 4 is unsafe", 3),
-        ("        position, speed = self.state\n", "        time.sleep(0.15)\n        position, speed = self.state\n", "the rig is too slow for dt = 0.05 s", 0),
-        ("        position, speed = self.state\n", "        position, speed = self.state\n        time.sleep(60 * (speed > 0.7))\n", "did not end within 0.9 s", 2),
+        ("> 10.0", "> 0.06", "at step 2 is unsafe", 1),
+        ("= self.state\n", "= self.state\n        time.sleep(0.15)\n", "the rig is too slow for dt = 0.05 s", 0),
+        ("= self.state\n", "= self.state\n        time.sleep(60 * (position > 0.06))\n", "did not end within 0.9 s", 2),
     ],
-)  # fmt: skip
+)
 def test_a_rig_stops_after_every_failure_and_keeps_its_steps(
     invoke: Any, old: str, new: str, reason: str, steps: int
 ) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from ctxval._util.files import MADE_BY, write_text
 from ctxval._util.onnx_network import GraphValue, require_onnx
+from ctxval._util.toml import toml_text
 from ctxval.core.model import Model
 from ctxval.errors import InputError
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
@@ -56,18 +57,13 @@ def write_model_file(path: Path, model: Model, step: str | None = None) -> list[
     if isinstance(model, Parametric):
         if step is None:
             raise InputError(_NO_REFERENCE)
-        values = ", ".join(f"{name} = {value!r}" for name, value in model.theta.items())
-        dt = model.dt or getattr(model.data, "dt", None)
-        lines = [
-            f"# {MADE_BY}",
-            "[model]",
-            'type = "Parametric"',
-            f'step = {{ ref = "{step}" }}',
-            f"theta = {{ {values} }}",
-            *([] if dt is None else [f"dt = {dt!r}"]),
-            *(["vectorized = true"] if model.vectorized else []),
-        ]
-        return [str(write_text(path, "\n".join([*lines, ""])))]
+        theta = {name: float(value) for name, value in model.theta.items()}
+        table: dict[str, Any] = {"type": "Parametric", "step": {"ref": step}, "theta": theta}
+        if (dt := model.dt or getattr(model.data, "dt", None)) is not None:
+            table["dt"] = float(dt)
+        if model.vectorized:
+            table["vectorized"] = True
+        return [str(write_text(path, f"# {MADE_BY}\n{toml_text({'model': table})}"))]
     if path.suffix == ".npz":
         write_model(path, model)
         return [str(path)]
