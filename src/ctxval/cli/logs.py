@@ -13,6 +13,7 @@ import numpy as np
 from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.columns import CsvTable
 from ctxval._util.progress import advance, stage
+from ctxval._util.refusals import reworded
 from ctxval._util.representation import task_text
 from ctxval._util.texts import shell_word
 from ctxval._util.toml import require_unedited, write_toml
@@ -22,6 +23,7 @@ from ctxval.campaign.watching import FALSE_ALARMS
 from ctxval.cli.base import FALSIFIED, Allowed, command, notes, out, print_columns, require_outputs
 from ctxval.cli.config.stored_settings import Limits, Opened, open_store
 from ctxval.cli.recordings import Logs, print_breaks, print_errors
+from ctxval.core.labels import require_names
 from ctxval.core.trajectory import Trajectory
 from ctxval.data import Field, LogMapping, Observer
 from ctxval.errors import ExecutionError, InputError
@@ -164,6 +166,8 @@ def start(logs: list[Path], reading: Logs, out_: Path = Path("start"), force: bo
         require_unedited(files["experiment.toml"])
     stated = reading.stated()
     result = survey(logs, stated, dt=reading.dt, seed=seed)
+    with reworded("give the fields other names with --state NAME=FIELD and --input NAME=FIELD", InputError):
+        require_names(result.recordings.states, result.recordings.inputs)
     _print_survey(result)
     write_toml(files["mapping.toml"], mapping_content(result.mapping, result.recordings.dt))
     write_model(files["model.npz"], result.best.model)
