@@ -225,8 +225,8 @@ def mapping_content(mapping: LogMapping, dt: float) -> dict[str, Any]:
     return content
 
 
-def experiment_content(result: Survey) -> Mapping[str, Any]:
-    """Return an experiment file to edit: goals within the recorded range of the first state, and LQR on the model."""
+def experiment_content(result: Survey) -> Any:
+    """Return a document of tomlkit, an experiment to edit: goals within the recorded range of the first state, and LQR on the model."""
     import tomlkit  # imported here: `watch` does not need it
 
     recordings = result.recordings
