@@ -226,7 +226,7 @@ def mapping_content(mapping: LogMapping, dt: float) -> dict[str, Any]:
 
 
 def experiment_content(result: Survey) -> Any:
-    """Return a document of tomlkit, an experiment to edit: goals within the recorded range of the first state, and LQR on the model."""
+    """Return an experiment to edit, a document of tomlkit: goals in the recorded range of the first state, and LQR."""
     import tomlkit  # imported here: `watch` does not need it
 
     recordings = result.recordings
