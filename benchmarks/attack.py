@@ -46,6 +46,7 @@ from hostile import (  # noqa: E402
     oracles,
     served,
     stores,
+    written,
 )
 from hostile.cage import SENTINEL, STATUSES, Case, Outcome, Watched, carry_out, declared  # noqa: E402
 from hostile.values import Rng, pick  # noqa: E402
@@ -108,6 +109,7 @@ def prepare(base: Path) -> Path:
     (base / "rig.toml").write_text(_MANUAL)
     (base / "table.toml").write_text(_MANUAL + clothes.MAPPING)
     done(base, "init", "experiment.toml")
+    done(base, "init", "cart.toml", "--hardware")
     # Learned dynamics take as long as a hang.
     (base / "experiment.toml").write_text((base / "experiment.toml").read_text().replace('"auto"  ', '"posterior"  '))
     with (base / "experiment_system.py").open("a") as file:
@@ -263,7 +265,7 @@ FAMILIES: dict[str, Family] = {
     "crafted-own": Family("the same, for stores that this user made", 0.05, _store(stores.crafted), own=True),
     "coded": Family("stores whose settings name code", 0.05, _store(stores.coded, "a.sqlite")),
     "no-store": Family("pipes, devices, folders and others in place of a store", 0.05, _store(stores.no_store)),
-    "told": Family("recordings for `ctxval tell`, NPZ and CSV", 0.1, _told, own=True),
+    "told": Family("recordings for `ctxval tell`, NPZ and CSV", 0.078, _told, own=True),
     "imported": Family("tables of runs for `ctxval import`", 0.06, _imported, own=True),
     "data": Family("recordings and networks for models", 0.03, _data),
     "toml": Family("experiment files", 0.05, _toml),
@@ -274,6 +276,8 @@ FAMILIES: dict[str, Family] = {
     "outputs": Family("outputs onto inputs, and other files", 0.03, doors.outputs, own=True),
     "secrets": Family("systems that use secrets", 0.02, doors.secret_system, own=True),
     "served": Family("requests to `ctxval serve`", 0.02, served.case, own=True, each=served.REQUESTS),
+    "names": Family("names of fields in the files that `start` writes", 0.02, written.names, own=True),
+    "rigs": Family("rigs that overrun, time out and fail", 0.002, written.rig),
     "arguments": Family("arguments", 0.05, _arguments, own=True),
     "numbers": Family("-0.0, NaN and others for every number that is stored", 0.03, numbers.case, own=True),
 }

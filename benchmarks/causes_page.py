@@ -114,7 +114,8 @@ def servo() -> str:
         f"{EXECUTIONS} recordings. It explains {shares} of the squared deviations of held-out recordings in closed "
         "loop, more than the next three causes do. It is said with its share, and not named as the cause: the largest "
         "distance of the recordings from their predictions is larger with it than from M, as it is with the published "
-        "models m3 and m4, which have such a friction."
+        "models m3 and m4, which have such a friction. The recordings are published by the Rhoban team "
+        "([Rhoban/bam](https://github.com/Rhoban/bam), Apache-2.0)."
     )
 
 

@@ -27,6 +27,7 @@ from study_servo import (
     SHARES,
     SHOWN,
     STORED,
+    require_recordings,
     servo,
     validation,
 )
@@ -41,14 +42,17 @@ PAGE = """\
 it in 16 closed loops, four references at four gains of the servo's firmware, and has published them with friction
 models of the servo ([source and licence](https://github.com/Rhoban/bam), Apache-2.0; Duclusaud, Passault and
 others, *Extended Friction Models for the Physics Simulation of Servo Actuators*, arXiv 2410.08650). The recordings
-are in `examples/servo/recordings`. So this is a system that nobody here has built, with what real recordings have:
+are no part of ctxval. They are the 16 files with a mass of 0.49 kg at a length of 0.1 m in the folder
+`bam/data.bak/processed` of that repository at commit af22604, and FOLDER below is a folder with these files. The
+pictures and numbers of this page are made from them. The system was built by others, and has the limits of real
+recordings:
 only the angle is recorded, by an encoder with 4096 counts per turn; the torque is switched off in some runs; and
 there are 16 runs and no more.
 
 ```console
 $ cd examples/servo
-$ ctxval run servo:experiment --threshold 0.38
-$ ctxval run servo:experiment --threshold 0.6 --option friction=m4
+$ ctxval run servo:experiment --option folder=FOLDER --threshold 0.38
+$ ctxval run servo:experiment --option folder=FOLDER --threshold 0.6 --option friction=m4
 ```
 
 The tasks are a [suite](how-to/suites.md), and `systems.Recorded` gives the recording of a task when it is chosen.
@@ -301,5 +305,6 @@ def draw() -> None:
 
 
 if __name__ == "__main__":
+    require_recordings()
     draw()
     (DOCS / "servo.md").write_text(page())

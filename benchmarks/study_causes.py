@@ -144,6 +144,9 @@ def main() -> None:
     parser.add_argument("--noise", nargs="*", type=float, default=NOISES, help="in shares of ranges")
     arguments = parser.parse_args()
     if arguments.robots == "servo":
+        from study_servo import require_recordings
+
+        require_recordings()
         for seed in range(SEEDS):
             if (RULE, seed) not in SERVO:
                 SERVO.append(on_servo(seed))

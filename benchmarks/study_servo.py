@@ -2,12 +2,14 @@
 
 ``python benchmarks/study_servo.py`` runs what is not stored yet. Each campaign sees one recording at a time; the
 others judge it. Comparisons of the models see one at a time too. Refinements learn from half of the recordings, and
-the other half judges them. docs/servo.md is written from the results by ``servo_page.py``.
+the other half judges them. docs/servo.md is written from the results by ``servo_page.py``. The recordings lie in the
+folder ``bam_xl330`` of the one that CTXVAL_DATA names, or of ``../shared/data``.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from functools import cache
@@ -27,6 +29,8 @@ SERVO = Path(__file__).parents[1] / "examples" / "servo"
 sys.path.insert(0, str(SERVO))
 import servo  # noqa: E402  # the example is no package
 
+DATA = Path(os.environ.get("CTXVAL_DATA") or Path(__file__).parents[2] / "shared" / "data") / "bam_xl330"
+
 PAIRS = ("sin_sin-200,lift_and_drop-800", "up_and_down-400,sin_time_square-800", "sin_sin-400,lift_and_drop-400")
 """Pairs of recordings to which models are fitted; they were written down before the first fit."""
 
@@ -45,11 +49,18 @@ COMPARED_STORED = JsonLines(RESULTS / "servo_comparisons.jsonl", ("models", "see
 Run = tuple[str, float, int]
 
 
+def require_recordings() -> None:
+    """End with status 0 and the reason if the recordings are not there."""
+    if not DATA.is_dir():
+        print(f"skipped: {DATA} does not exist; docs/servo.md says where the recordings are published")
+        raise SystemExit(0)
+
+
 @cache
 def validation(model: str) -> Validation:
     """Return the validation of a model: the name of a friction model, and the recordings that it is fitted to."""
     friction, _, pair = model.partition(" ")
-    return servo.experiment(friction=friction, fit=pair).validation
+    return servo.experiment(str(DATA), friction=friction, fit=pair).validation
 
 
 def root_mean_square(model: Trajectory, system: Trajectory, task: Task) -> Array:
@@ -163,6 +174,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seeds", type=int, default=SEEDS)
     options = parser.parse_args()
+    require_recordings()
     for model in (*MODELS, *FITTED):
         if (model,) not in DISTANCES:
             DISTANCES.append(of_model(model))

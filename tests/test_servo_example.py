@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
-import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,8 +11,10 @@ import numpy as np
 import pytest
 
 from ctxval import Campaign, compare, searches
+from ctxval.errors import InputError
 from ctxval.studies.causes import find_causes
 from rig_thorough import more
+from shared_data import shared_data
 
 FOLDER = Path(__file__).parents[1] / "examples" / "servo"
 
@@ -31,15 +31,26 @@ def servo() -> Iterator[ModuleType]:
         sys.modules.pop("servo", None)
 
 
-def test_the_recordings_are_small_and_state_their_source_and_licence() -> None:
-    files = list((FOLDER / "recordings").iterdir())
-    assert sum(path.stat().st_size for path in files if path.suffix == ".gz") <= 500_000
-    assert "Rhoban" in (FOLDER / "recordings" / "README.md").read_text()
-    assert "Apache License" in (FOLDER / "recordings" / "LICENSE").read_text()
-    for path in files:
-        if path.suffix == ".gz":
-            about = json.loads(gzip.decompress(path.read_bytes()))
-            assert path.name == f"{about['trajectory']}-{about['kp']}.json.gz"
+@pytest.fixture(scope="module")
+def folder() -> str:
+    return str(shared_data("bam_xl330"))
+
+
+def test_recordings_by_others_are_no_part_of_the_repository() -> None:
+    assert not list(FOLDER.parents[1].glob("examples/**/*.gz"))
+    page = (FOLDER.parents[1] / "docs" / "servo.md").read_text("utf-8")
+    assert all(fact in page for fact in ("Apache-2.0", "github.com/Rhoban/bam", "af22604", "arXiv 2410.08650"))
+
+
+def test_a_folder_without_the_recordings_is_refused(servo: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"has no recordings of \['lift_and_drop-100'"):
+        servo.experiment(str(tmp_path))
+
+
+def test_recordings_are_those_that_their_contents_name(servo: ModuleType, folder: str) -> None:
+    recordings = servo.Recordings(Path(folder))
+    assert set(recordings.runs) == set(recordings.suite.task_names)
+    assert recordings.of("sin_sin-100")[0, 0] == pytest.approx(-0.003067961575771161)
 
 
 @pytest.mark.parametrize("friction", ["m1", "m3", "m4"])
@@ -72,17 +83,17 @@ def test_the_firmware_is_limited_and_counts(servo: ModuleType) -> None:
     ("friction", "largest", "task"), [("m1", 0.427, "sin_sin-400"), *more(("m4", 0.522, "sin_time_square-800"))]
 )
 def test_distances_of_published_models_are_those_of_the_page(
-    servo: ModuleType, friction: str, largest: float, task: str
+    servo: ModuleType, folder: str, friction: str, largest: float, task: str
 ) -> None:
-    validation = servo.experiment(friction=friction).validation
+    validation = servo.experiment(folder, friction=friction).validation
     known = validation.distances(validation.space.grid(2))
     assert known.max() == pytest.approx(largest, abs=0.01)
     assert validation.space.task_names[int(known.argmax())] == task
 
 
 @pytest.mark.thorough  # `make servo` runs it for all published models
-def test_a_campaign_falsifies_m1_and_sees_only_what_it_executes(servo: ModuleType) -> None:
-    validation = servo.experiment(friction="m1").validation
+def test_a_campaign_falsifies_m1_and_sees_only_what_it_executes(servo: ModuleType, folder: str) -> None:
+    validation = servo.experiment(folder, friction="m1").validation
     revealed: list[str] = []
     given = validation.system.execute
 
@@ -100,8 +111,8 @@ def test_a_campaign_falsifies_m1_and_sees_only_what_it_executes(servo: ModuleTyp
 
 @pytest.mark.slow
 @pytest.mark.thorough
-def test_one_recording_counts_for_all_compared_models(servo: ModuleType) -> None:
-    models = {friction: servo.experiment(friction=friction).validation for friction in ("m3", "m4")}
+def test_one_recording_counts_for_all_compared_models(servo: ModuleType, folder: str) -> None:
+    models = {friction: servo.experiment(folder, friction=friction).validation for friction in ("m3", "m4")}
     found = compare(models, question="worst", budget=1)
     assert found.executions == 1
     assert [(result.executions, result.shared) for result in found.candidates].count((0, 0)) == 0
@@ -110,8 +121,9 @@ def test_one_recording_counts_for_all_compared_models(servo: ModuleType) -> None
 
 @pytest.mark.slow
 @pytest.mark.thorough
-def test_load_friction_explains_most_of_what_the_first_model_misses(servo: ModuleType) -> None:
-    campaign = Campaign(servo.experiment(friction="m1").validation, search=searches.by_name("random"), seed=0).run(5)
+def test_load_friction_explains_most_of_what_the_first_model_misses(servo: ModuleType, folder: str) -> None:
+    validation = servo.experiment(folder, friction="m1").validation
+    campaign = Campaign(validation, search=searches.by_name("random"), seed=0).run(5)
     report = find_causes(campaign)
     assert not report.named
     assert [cause.name for cause in report.explained[0].causes] == ["load-dependent friction"]

@@ -1,12 +1,16 @@
 """A real servo that turns a pendulum: published friction models against 16 recorded closed loops.
 
-The recordings and the models are those of the Rhoban team; see recordings/README.md. A task is a reference trajectory
-at a gain of the servo's firmware, so there are 16. ``ctxval run servo:experiment --option friction=m4`` is a
-campaign on the model m4.
+The Rhoban team publishes the recordings under the Apache License 2.0: https://github.com/Rhoban/bam, commit af22604,
+folder ``bam/data.bak/processed``, of which this example reads the 16 files with a mass of 0.49 kg at 0.1 m. They are no
+part of this repository. The friction models are written from the formulas and the identified values of that repository
+and of its paper (arXiv 2410.08650). A task is a reference trajectory at a gain of the firmware, so there are 16.
+``ctxval run servo:experiment --option folder=FOLDER --option friction=m4`` is a campaign on the model m4.
 """
 
 from __future__ import annotations
 
+import gzip
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,8 +24,8 @@ from ctxval.core.controller import Controller
 from ctxval.core.model import Model
 from ctxval.core.system import Outputs
 from ctxval.data import LogMapping, read_recordings
+from ctxval.errors import InputError
 
-RECORDINGS = Path(__file__).parent / "recordings"
 DT, HORIZON = 0.01, 599  # s, steps: the recordings have a sample every 5 ms, and the shortest one ends after 5.995 s
 TURN = 4096  # counts of the encoder per turn
 PATHS, GAINS = ("sin_sin", "lift_and_drop", "up_and_down", "sin_time_square"), (100, 200, 400, 800)
@@ -113,16 +117,26 @@ class Firmware:
         return np.stack(np.broadcast_arrays(duty, self.torque[..., t]), axis=-1)
 
 
+def files_in(folder: Path) -> dict[str, Path]:
+    """Return the recordings of a folder by trajectory and gain, which the files state."""
+    files = {}
+    for path in sorted(folder.glob("*.json.gz")):
+        about = json.loads(gzip.decompress(path.read_bytes()))
+        files[f"{about['trajectory']}-{about['kp']}"] = path
+    return files
+
+
 class Recordings:
     """The suite of tasks, and what is recorded of each: reference, switch of the torque, and first angle."""
 
-    def __init__(self, folder: Path = RECORDINGS) -> None:
+    def __init__(self, folder: Path) -> None:
         self.suite = TaskSuite({f"{path}-{gain}": {"path": path, "gain": gain} for gain in GAINS for path in PATHS})
         fields = LogMapping({"angle": "position", "goal": "goal_position", "torque": "torque_enable"}, dt=DT)
-        self.records = {
-            name: read_recordings([folder / f"{name}.json.gz"], fields).runs[0].trajectory.states[: HORIZON + 1]
-            for name in self.suite.task_names
-        }
+        files = files_in(folder)
+        if absent := set(self.suite.task_names) - set(files):
+            raise InputError(f"the folder {str(folder)!r} has no recordings of {sorted(absent)}; see docs/servo.md.")
+        self.runs = {name: read_recordings([files[name]], fields).runs[0].trajectory for name in self.suite.task_names}
+        self.records = {name: run.states[: HORIZON + 1] for name, run in self.runs.items()}
 
     def of(self, names: Any) -> Array:
         """Return the records of one or more tasks, ``(..., H + 1, 3)``: angle, reference, switch of the torque."""
@@ -158,18 +172,20 @@ def fitted(friction: Friction, tasks: Sequence[str], recordings: Recordings) -> 
     return replace(friction, **dict(zip(names, np.exp(found.x).tolist(), strict=True)))
 
 
-def experiment(seed: int = 0, friction: str = "m1", fit: str = "") -> Experiment:
-    """Return the validation of a friction model against the recordings, by the largest deviation.
+def experiment(folder: str, seed: int = 0, friction: str = "m1", fit: str = "") -> Experiment:
+    """Return the validation of a friction model against the recordings in a folder, by the largest deviation.
 
     With ``fit``, such as ``"sin_sin-400,up_and_down-100"``, its parameters are fitted to the recordings of these tasks.
     """
-    recordings, parameters = Recordings(), PUBLISHED[friction]
+    recordings, parameters = Recordings(Path(folder)), PUBLISHED[friction]
     if fit:
         parameters = fitted(parameters, fit.split(","), recordings)
     validation = Validation(
         space=recordings.suite,
         task=recordings.task,
-        system=systems.Recorded(RECORDINGS, LogMapping({"angle": "position"}, dt=DT)),
+        system=systems.Recorded(
+            {name: replace(run, states=run.states[:, :1]) for name, run in recordings.runs.items()}
+        ),
         model=Servo(parameters),
         synthesizer=recordings,
         distance=distances.MaximumDeviation(),

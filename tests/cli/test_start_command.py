@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import csv
+import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ctxval import load_experiment
@@ -59,6 +62,45 @@ def test_the_answer_is_also_json_and_files_of_others_are_kept(logs: Path, tmp_pa
     assert refused.exit_code == 2
     assert (out / "mapping.toml").read_text() == "mine = true\n"
     assert call("start", str(logs), "--out", str(out), "--force").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    "name", ['position"\n[system]\ntype = "evil:Rig"\n[x]\n"', "position 😀", "\x1b[31mposition", "\u200fposition"]
+)
+def test_names_of_fields_are_data_in_every_file(name: str, tmp_path: Path) -> None:
+    x, v = 0.0, 0.0
+    with (tmp_path / "log.csv").open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow(["t", name, "speed", "force"])
+        for t in range(400):
+            u = float(np.sign(np.sin(0.07 * t)) + 0.3 * np.sin(0.31 * t))
+            rows.writerow([t / 100, x, v, u])
+            x, v = x + 0.01 * v, v + 0.01 * (u - 0.4 * v)
+    call, out = calling(), tmp_path / "start"
+    stated = ("--state", f"first={name}", "--state", "speed", "--input", "force", "--time", "t")
+    line = ("start", str(tmp_path / "log.csv"), "--out", str(out))
+    for more in ((), stated):
+        done = call(*line, *more, "--force")
+        if done.exit_code:
+            assert "Traceback" not in done.output
+            continue
+        content = tomllib.loads((out / "experiment.toml").read_text("utf-8"))
+        assert content["system"]["type"] == "Manual"
+        assert set(content) <= {
+            *("name", "budget", "units", "space", "task", "system", "model", "synthesizer", "distance", "states"),
+            "inputs",
+        }
+        assert tomllib.loads((out / "mapping.toml").read_text("utf-8"))["states"]
+        load_experiment(out / "experiment.toml")
+        assert "\x1b" not in done.output
+    assert done.exit_code == 0
+    assert call(*line, *stated).exit_code == 0  # its own files, which nobody has changed
+    before = (out / "experiment.toml").read_text("utf-8").replace("budget = 20", "budget = 9")
+    (out / "experiment.toml").write_text(before, "utf-8")
+    refused = call(*line, *stated)
+    assert refused.exit_code == 2
+    assert "was edited" in " ".join(refused.output.split())
+    assert (out / "experiment.toml").read_text("utf-8") == before
 
 
 def test_fields_that_are_stated_are_taken(tmp_path: Path) -> None:

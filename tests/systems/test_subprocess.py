@@ -119,7 +119,90 @@ def test_names_and_units_go_into_the_files_and_folders_can_be_kept(tmp_path: Pat
     assert (folders[0] / "stdout.txt").read_text() == "done\n"
 
 
+# Times
+
+
+def test_measured_times_that_jitter_are_brought_to_those_of_the_task(tmp_path: Path) -> None:
+    late = "late = 0.02 if t % 2 else 0.0"
+    code = RIG.replace('row = [t * task["dt"], *x]', late + '; row = [t * task["dt"] + late, t + 10 * late, 0.0]')
+    trajectory = python(tmp_path, code).execute(designed(), TASK)
+    np.testing.assert_array_equal(trajectory.times, TASK.times)
+    np.testing.assert_allclose(trajectory.states[1:-1:2, 0], np.arange(1, 20, 2), atol=1e-9)
+
+
+@pytest.mark.parametrize("clock", ["t * 0.3", "t * 0.1 * 1.02", "t * 0.1 + (0.04 if t == 7 else 0)", "t * 0.001"])
+def test_a_rig_that_does_not_keep_the_time_step_is_refused_with_its_period(clock: str, tmp_path: Path) -> None:
+    with pytest.raises(ExecutionError, match=r"steps of 0\.1 s: .* measured period is"):
+        python(tmp_path, RIG.replace('t * task["dt"]', clock)).execute(designed(), TASK)
+
+
 # Failures
+
+
+STOPS = RIG.replace(
+    "folder = Path",
+    """import signal, time
+
+
+def stop(number, frame):
+    with open(folder / "trajectory.csv", "w", newline="") as file:
+        csv.writer(file).writerows([["t", "x0", "x1", "u0"], *rows])
+    Path(sys.argv[1], "stopped").touch()
+    sys.exit(0)
+
+
+signal.signal(signal.SIGTERM, stop)
+folder = Path""",
+).replace(
+    "    rows.append(row)",
+    """    rows.append(row)
+    if t == 6:
+        Path(sys.argv[1], "runs").touch()
+        time.sleep(60)""",
+)
+
+
+def test_a_rig_has_time_to_stop_and_its_recording_is_kept(tmp_path: Path) -> None:
+    system = python(tmp_path, STOPS, str(tmp_path), timeout=0.5)
+    trajectory = system.execute(designed(), TASK)
+    assert (tmp_path / "stopped").exists()
+    assert trajectory.ended == "the command did not end within 0.5 s and was stopped"
+    space = TaskSpace(speed=(-0.6, -0.5))
+    validation = Validation(
+        space=space,
+        task=lambda p: Task(np.stack([np.ones_like(p.speed), p.speed], -1), goal=[0.2, 0.0], horizon=20, dt=0.1),
+        system=system,
+        model=MODEL,
+        synthesizer=controllers.LQR([10.0, 1.0], [0.1]),
+        distance=distances.FinalState(),
+    )
+    campaign = Campaign(validation, seed=0).run(1)
+    (trial,) = campaign.failed
+    _, kept = campaign.trajectories(trial)
+    assert "was stopped" in str(trial.failure)
+    assert kept is not None
+    assert kept.horizon == 6
+
+
+def test_a_rig_that_ignores_sigterm_is_killed_after_the_grace_period(tmp_path: Path) -> None:
+    code = SPAWN + "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)"
+    began = time.monotonic()
+    with pytest.raises(ExecutionError, match="was stopped"):
+        python(tmp_path, code, str(tmp_path), timeout=0.3, grace=0.1).execute(designed(), TASK)
+    assert time.monotonic() - began < 20
+    assert gone(int((tmp_path / "pid").read_text()))
+
+
+def test_an_interrupted_rig_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(stdout: Any, timeout: float) -> bool:
+        while not (tmp_path / "runs").exists():
+            time.sleep(0.005)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(supervised, "_readable", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        python(tmp_path, STOPS, str(tmp_path)).execute(designed(), TASK)
+    assert (tmp_path / "stopped").exists()
 
 
 @pytest.mark.parametrize(
@@ -222,7 +305,7 @@ def test_a_command_ends_with_a_campaign_that_is_killed(workers: int, tmp_path: P
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
 @pytest.mark.parametrize(
-    ("end", "sentence"), [("time.sleep(60)", "did not end within 1 s and was killed"), ("sys.exit(3)", "status 3")]
+    ("end", "sentence"), [("time.sleep(60)", "did not end within 1 s and was stopped"), ("sys.exit(3)", "status 3")]
 )
 def test_whatever_the_command_started_ends_with_it(end: str, sentence: str, tmp_path: Path) -> None:
     started = time.monotonic()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shlex
 from collections.abc import Iterable, Sequence
 from typing import TypeVar
 
@@ -83,6 +85,16 @@ def reason_of(error: BaseException) -> str:
     name, message = type(error).__name__, plain(error)
     # Room for a sentence around it, so that a text is not shortened twice.
     return shortened(f"{name}: {message}" if message and message != name else name, LONGEST - 200)
+
+
+def shell_word(path: object) -> str:
+    """Return a file's name as a word of a command to copy, without control characters or marks of direction."""
+    text = str(path)
+    if text.isprintable():
+        return shlex.quote(text)
+    escaped = text.replace("\\", "\\\\").replace("'", "\\'")
+    codes = (c if c.isprintable() else "".join(f"\\x{byte:02x}" for byte in os.fsencode(c)) for c in escaped)
+    return f"$'{''.join(codes)}'"
 
 
 def guarded(text: str) -> str:

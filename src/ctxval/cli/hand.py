@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from ctxval import Plan, Store
 from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.progress import advance, stage
 from ctxval._util.refusals import require_extra
-from ctxval._util.texts import enumerated
+from ctxval._util.texts import enumerated, shell_word
 from ctxval.campaign import by_hand
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
@@ -100,7 +99,7 @@ def ask(
     if others:
         trials = "trial is" if len(others) == 1 else "trials are"
         out.say(f"{len(others)} other {trials} open: {enumerated(others, 10)}.")
-    out.say(f"next: ctxval tell {shlex.quote(str(path))} {waiting.number} --trajectory run.csv")
+    out.say(f"next: ctxval tell {shell_word(path)} {waiting.number} --trajectory run.csv")
     return {
         "trial": waiting.number,
         "task": waiting.trial.parameters,

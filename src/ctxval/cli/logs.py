@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
 
 from ctxval._util.checked import NonNegativeFloat, require
-from ctxval._util.files import write_text
 from ctxval._util.progress import advance, stage
+from ctxval._util.refusals import reworded
 from ctxval._util.representation import task_text
 from ctxval._util.tables import CsvTable
+from ctxval._util.texts import shell_word
+from ctxval._util.toml import require_unedited, write_toml
 from ctxval.campaign.by_hand import parameters_from, read_runs
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.watching import FALSE_ALARMS
 from ctxval.cli.base import FALSIFIED, Allowed, command, notes, out, print_columns, require_outputs
 from ctxval.cli.config.stored_settings import Limits, Opened, open_store
 from ctxval.cli.recordings import Logs, print_breaks, print_errors
+from ctxval.core.labels import require_names
 from ctxval.core.trajectory import Trajectory
 from ctxval.data import Field, LogMapping, Observer
 from ctxval.errors import ExecutionError, InputError
@@ -168,20 +169,25 @@ def _without_task(opened: Opened, path: Path, reading: Logs) -> Iterator[_Run]:
 def start(logs: list[Path], reading: Logs, out_: Path = Path("start"), force: bool = False, seed: int = 0) -> Any:
     files = {name: out_ / name for name in ("mapping.toml", "model.npz", "experiment.toml", "report.html")}
     require_outputs({f"--out {name}": path for name, path in files.items()}, [*logs, reading.mapping], force=force)
+    if not force:
+        require_unedited(files["mapping.toml"])
+        require_unedited(files["experiment.toml"])
     stated = reading.stated()
     result = survey(logs, stated, time=reading.time, dt=reading.dt, seed=seed)
+    with reworded("give the fields other names with --state NAME=FIELD and --input NAME=FIELD", InputError):
+        require_names(result.recordings.states, result.recordings.inputs)
     _print_survey(result)
-    write_text(files["mapping.toml"], mapping_text(result.mapping, result.recordings.dt))
+    write_toml(files["mapping.toml"], mapping_content(result.mapping, result.recordings.dt))
     write_model(files["model.npz"], result.best.model)
     write_replay_page(result.replay, files["report.html"], name=f"the {result.best.kind} model")
     if result.recordings.inputs:
-        write_text(files["experiment.toml"], experiment_text(result))
+        write_toml(files["experiment.toml"], experiment_content(result))
     else:
         del files["experiment.toml"]
     out.say("")
     out.say(f"{', '.join(files)} in {out_}")
     if result.recordings.inputs:
-        where = shlex.quote(str(files["experiment.toml"]))
+        where = shell_word(files["experiment.toml"])
         out.say(f"next: edit {where}, and then ctxval check {where}")
     return {**result.to_json(), "files": [str(path) for path in files.values()]}
 
@@ -208,52 +214,49 @@ def _print_survey(result: Survey) -> None:
     out.say((f"{result.statement[:1].upper()}{result.statement[1:]}.", "bold"), wrap=True)
 
 
-def mapping_text(mapping: LogMapping, dt: float) -> str:
+def mapping_content(mapping: LogMapping, dt: float) -> dict[str, Any]:
+    """Return the content of a TOML file from which :meth:`LogMapping.from_toml` makes a mapping."""
     usual = vars(Field("x"))
 
-    def text_of(field: Field) -> str:
+    def content_of(field: Field) -> Any:
         changed = {name: value for name, value in vars(field).items() if value != usual[name] and value != ""}
-        if set(changed) == {"path"}:
-            return json.dumps(field.path)
-        return f"{{ {', '.join(f'{name} = {json.dumps(value)}' for name, value in changed.items())} }}"
+        return field.path if set(changed) == {"path"} else changed
 
-    lines = [f"dt = {dt!r}  # time step of the model, seconds"]
+    content: dict[str, Any] = {"dt": dt}
     for name in ("time", "time_unit", "delay", "longest_gap", "lags", "valid"):
         if value := getattr(mapping, name):
-            lines.append(f"{name} = {json.dumps(value)}")
+            content[name] = value
     for kind in ("states", "inputs"):
-        fields = getattr(mapping, kind).items()
-        lines += ["", f"[{kind}]", *(f"{json.dumps(name)} = {text_of(field)}" for name, field in fields)]
+        content[kind] = {name: content_of(field) for name, field in getattr(mapping, kind).items()}
     if isinstance(mapping.observer, Observer):
-        named = ", ".join(f"{json.dumps(name)} = {json.dumps(unit)}" for name, unit in mapping.observer.states.items())
-        lines += ["", "[observer]", f"function = {json.dumps(mapping.observer.reference)}", f"states = {{ {named} }}"]
-    return "\n".join(lines) + "\n"
+        content["observer"] = {"function": mapping.observer.reference, "states": dict(mapping.observer.states)}
+    return content
 
 
-def experiment_text(result: Survey) -> str:
-    """Return an experiment file to edit: goals within the recorded range of the first state, and LQR on the model."""
+def experiment_content(result: Survey) -> Any:
+    """Return an experiment to edit, a document of tomlkit: goals in the recorded range of the first state, and LQR."""
+    import tomlkit  # imported here: `watch` does not need it
+
     recordings = result.recordings
-    states, inputs = recordings.states, recordings.inputs
+    states, inputs = dict(recordings.states), dict(recordings.inputs)
     x = np.concatenate([run.trajectory.states for run in recordings.runs])
     u = np.concatenate([run.trajectory.inputs for run in recordings.runs])
-    first, unit = next(iter(states.items()))
+    unit, dt = next(iter(states.values())), float(recordings.dt)
 
     def numbers(values: Any) -> list[float]:
         return [float(f"{value:.3g}") for value in values]
 
-    values = {
-        "unit": unit,
-        "goals": numbers(np.quantile(x[:, 0], [0.05, 0.95])) + ([unit] if unit else []),
-        "start": numbers(np.median([run.trajectory.states[0] for run in recordings.runs], axis=0)),
-        "goal": ["goal", *[0.0] * (len(states) - 1)],
-        "horizon": min(max(result.reach[1], 10), 200),
-        "dt": recordings.dt,
-        "Q": numbers(1 / np.maximum(x.var(axis=0), 1e-12)),
-        "R": numbers(1 / np.maximum(u.var(axis=0), 1e-12)),
-    }
-    texts = {name: json.dumps(value) for name, value in values.items()}
-    for kind, units in (("state", states), ("input", inputs)):
-        rows = [f"{json.dumps(name)} = {json.dumps(unit)}" for name, unit in units.items()]
-        texts |= {f"{kind}s": ", ".join(units), f"{kind}_units": ", ".join(rows), f"{kind}_rows": "\n".join(rows)}
-    template = (Path(__file__).parent / "example" / "start.toml.txt").read_text("utf-8")
-    return Template(template).substitute(texts, first=first)
+    content: Any = tomlkit.parse((Path(__file__).parent / "example" / "start.toml.txt").read_text("utf-8"))
+    content["units"] = unit
+    content["space"]["goal"] = [*numbers(np.quantile(x[:, 0], [0.05, 0.95])), *([unit] if unit else [])]
+    start = numbers(np.median([run.trajectory.states[0] for run in recordings.runs], axis=0))
+    goal = ["goal", *[0.0] * (len(states) - 1)]
+    horizon = int(min(max(result.reach[1], 10), 200))
+    content["task"].update({"initial_state": start, "goal": goal, "horizon": horizon, "dt": dt})
+    content["system"].update({"dt": dt})
+    for kind, units in (("states", states), ("inputs", inputs)):
+        content[kind].update(units)
+        content["system"][kind].update(units)
+    for weight, values in (("Q", x), ("R", u)):
+        content["synthesizer"][weight] = numbers(1 / np.maximum(values.var(axis=0), 1e-12))
+    return content

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 import warnings
 from dataclasses import asdict
@@ -13,6 +12,8 @@ from typing import Any
 from rich.progress import Progress, TextColumn
 
 from ctxval._util.files import write_text
+from ctxval._util.texts import shell_word
+from ctxval._util.toml import toml_text
 from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, err, named_values, out, print_table
 from ctxval.cli.config.check import aspect1_findings, check_experiment
 from ctxval.cli.config.parts import part, plain_options
@@ -33,8 +34,8 @@ def init(file: Path = Path("experiment.toml"), hardware: bool = False) -> Any:
     paths = {"experiment.toml": file, f"{kind}.py.txt": file.with_name(f"{module}.py")}
     if hardware:
         about = f"here a program that executes one task on a rig: {module}.py"
-        program = f"{Path(sys.executable).name} {module}.py"
-        system = f'type = "Subprocess"\ncommand = "{program}"\ntimeout = 60            # seconds'
+        program = toml_text({"command": f"{Path(sys.executable).name} {module}.py"})
+        system = f'type = "Subprocess"\n{program}timeout = 60            # seconds'
     else:
         about = f"here a step function in {module}.py"
         system = f'type = "Simulated"\nstep = {{ ref = "{module}:step" }}'
@@ -43,8 +44,8 @@ def init(file: Path = Path("experiment.toml"), hardware: bool = False) -> Any:
             raise InputError(f"{path} already exists and was not changed.")
     for example, path in paths.items():
         text = (Path(__file__).parent / "example" / example).read_text("utf-8")
-        write_text(path, Template(text).substitute(name=file.name, about=about, system=system))
-    quoted = shlex.quote(str(file))
+        write_text(path, Template(text).substitute(name=shell_word(file.name), about=about, system=system))
+    quoted = shell_word(file)
     written = [str(path) for path in paths.values()]
     out.say(" and ".join(written))
     out.say(f"next: ctxval check {quoted}")

@@ -322,6 +322,24 @@ class Trajectory:
 _TIMES = 0.01  # largest difference between the times of a recording and those of its task, in steps
 
 
+_JITTER = 0.25  # largest difference between measured times and those of a task, in steps, that interpolation mends
+
+
+def at_times(trajectory: Trajectory, times: Array) -> Trajectory:
+    """Return a trajectory at the times of a task ``(H + 1,)``, counted from its first time, from its measured times.
+
+    States are interpolated linearly. The inputs stay, because each was applied when its state was measured. An
+    InputError refuses times that are further away than a quarter of a step.
+    """
+    recorded, dt = trajectory.times - trajectory.times[0], np.diff(times)[:1]
+    misses = np.abs(recorded - times) if len(recorded) == len(times) else np.array([np.inf])
+    if (misses <= _TIMES * dt).all() or not (misses <= _JITTER * dt).all():
+        require_times(trajectory, times)
+        return trajectory
+    states = np.stack([np.interp(times, recorded, column) for column in trajectory.states.T], axis=-1)
+    return Trajectory(times, states, trajectory.inputs, trajectory.ended)
+
+
 def require_times(trajectory: Trajectory, times: Array) -> None:
     """Check that a trajectory has these times ``(H + 1,)``, counted from its first time."""
     dt, recorded = times[1] - times[0], trajectory.times - trajectory.times[0]
@@ -338,7 +356,7 @@ def require_times(trajectory: Trajectory, times: Array) -> None:
         raise InputError(f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, got {got}.")
     k = int(np.argmax(~(misses <= _TIMES * dt)))
     first = f"time {k} must be {times[k]:g} s after the first, got {recorded[k]:g} s"
-    largest = f"The largest difference is {np.max(misses):.3g} s{advice}"
+    largest = f"The measured period is {period:g} s. The largest difference is {np.max(misses):.3g} s{advice}"
     raise InputError(f"the trajectory must have steps of {dt:g} s: {first}. {largest}.")
 
 

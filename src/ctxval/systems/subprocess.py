@@ -18,10 +18,11 @@ import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import IO
 
-from ctxval._util.checked import TimeLimit
+from ctxval._util.checked import NonNegativeFloat, TimeLimit
 from ctxval._util.files import temporary_folder
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
@@ -29,21 +30,27 @@ from ctxval.core.controller import Controller
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.labels import require_names
 from ctxval.core.task import Task
-from ctxval.core.trajectory import COMPLETE, Trajectory, require_times
+from ctxval.core.trajectory import COMPLETE, Trajectory, at_times
 from ctxval.errors import ExecutionError, InputError
 from ctxval.systems.episode import require_one
 
 _PROGRAM = Path(__file__).absolute().with_name("supervisor.py")
 
-_GRACE_PERIOD = 10.0  # seconds that a supervisor has to end its command before it is killed itself
+_GRACE_PERIOD = 10.0  # seconds that a supervisor has to kill its command before it is killed itself
 
 
 def run_supervised(
-    command: Sequence[str], folder: Path | None, stdout: IO[bytes], stderr: IO[bytes], timeout: float
+    command: Sequence[str],
+    folder: Path | None,
+    stdout: IO[bytes],
+    stderr: IO[bytes],
+    timeout: float,
+    grace: float = 0.0,
 ) -> int | None:
     """Run a command, and end all processes that it started, however this call ends.
 
-    Return the exit status, negative for a signal; None if the command did not end in time and was killed.
+    A command that must be ended gets SIGTERM, and SIGKILL after ``grace`` seconds. Return the exit status, negative for
+    a signal, or None if the command did not end in time.
     """
     if os.name != "posix":
         # Run a command on a system without process groups; processes that it starts may outlive it.
@@ -59,7 +66,7 @@ def run_supervised(
     descriptors = stdout.fileno(), stderr.fileno()
     # -I, because modules in the folder of the program have the same names as other modules. A session of its own,
     # because Ctrl-C is for the campaign, which ends after the running executions.
-    program = [sys.executable, "-I", "-S", str(_PROGRAM), str(os.getpid()), *map(str, descriptors), *command]
+    program = [sys.executable, "-I", "-S", str(_PROGRAM), str(os.getpid()), *map(str, (*descriptors, grace)), *command]
     with reworded("the command cannot be started", OSError, to=ExecutionError):
         supervisor = subprocess.Popen(
             program,
@@ -85,7 +92,7 @@ def run_supervised(
             raise ExecutionError("the process that watches the command was killed")
         return int(status)
     finally:
-        _end(supervisor, child)
+        _end(supervisor, child, grace)
 
 
 def _readable(stdout: IO[bytes], timeout: float) -> bool:
@@ -94,7 +101,7 @@ def _readable(stdout: IO[bytes], timeout: float) -> bool:
         return bool(selector.select(timeout if timeout < 1e6 else None))  # the system does not take years
 
 
-def _end(supervisor: subprocess.Popen[bytes], child: int) -> None:
+def _end(supervisor: subprocess.Popen[bytes], child: int, grace: float) -> None:
     """Make the supervisor end the remaining processes; if it does not, kill it and the command's group."""
     assert supervisor.stdin is not None
     assert supervisor.stdout is not None
@@ -103,7 +110,7 @@ def _end(supervisor: subprocess.Popen[bytes], child: int) -> None:
     with contextlib.suppress(OSError):
         supervisor.stdin.close()
     try:
-        supervisor.wait(_GRACE_PERIOD)
+        supervisor.wait(grace + _GRACE_PERIOD)
     except subprocess.TimeoutExpired:  # e.g. somebody stopped the supervisor by SIGSTOP
         supervisor.kill()
         supervisor.wait()
@@ -124,13 +131,18 @@ class Subprocess:
     ``t, x0, ..., u0, ...``, no inputs in the last row) into that folder, as a regular file. The command runs in the
     folder that was the current folder when this object was made.
 
-    If the exit status is not 0, the execution has failed, and the last line of stderr is the reason. All processes that
-    the command started end with it, and also if this process ends in any way; on Linux this includes processes that
-    left its process group.
+    If the exit status is not 0, the execution has failed, and the last line of stderr is the reason. A trajectory that
+    the command has written until then is kept with the failed trial. All processes that the command started end with
+    it, and also if this process ends in any way; on Linux this includes processes that left its process group. A
+    command that must be ended gets SIGTERM, so that it can stop the rig and write its recording.
+
+    The times should be measured. If they differ by at most a quarter of a step from those of the task, the states are
+    interpolated to the times of the task; otherwise the execution has failed.
 
     Args:
         command: the program and its arguments; a string is split like a shell does. No shell runs the command.
-        timeout: seconds after which the command and all processes that it started are killed.
+        timeout: seconds after which the command and all processes that it started are ended.
+        grace: seconds between SIGTERM and SIGKILL.
         states, inputs: names of the states and inputs with their units, for the files.
         keep: a folder in which the folders of all executions are kept, to examine failures.
         folder: folder in which the files that the command names are searched before the current one.
@@ -141,6 +153,7 @@ class Subprocess:
         command: str | Sequence[str],
         *,
         timeout: TimeLimit,
+        grace: NonNegativeFloat = 5.0,
         states: Mapping[str, str] | None = None,
         inputs: Mapping[str, str] | None = None,
         keep: str | Path | None = None,
@@ -157,6 +170,7 @@ class Subprocess:
         if not self.command or shutil.which(self._located[0]) is None:
             raise InputError(f"the command must begin with a program that can be run, got {self.command}.")
         self.timeout = timeout
+        self.grace = grace
         self.states = None if states is None else dict(states)
         self.inputs = None if inputs is None else dict(inputs)
         require_names(states or (), inputs or ())
@@ -185,17 +199,23 @@ class Subprocess:
             home = self._home if self._home.is_dir() else None  # on another machine the folder may not exist
             # Output goes to files, because a grandchild that keeps a pipe open would make us wait for it.
             with (folder / "stdout.txt").open("wb") as stdout, (folder / "stderr.txt").open("w+b") as stderr:
-                status = run_supervised([*self._located, str(folder)], home, stdout, stderr, self.timeout)
+                command = [*self._located, str(folder)]
+                status = run_supervised(command, home, stdout, stderr, self.timeout, self.grace)
                 # The file is not opened again, because its name may now stand for another file.
                 stderr.seek(max(0, stderr.seek(0, os.SEEK_END) - 4096))
                 lines = stderr.read().decode("utf-8", "replace").splitlines() if status else []
+            if status == 0:
+                return _trajectory(folder, task)
             if status is None:
-                raise ExecutionError(f"the command did not end within {self.timeout:g} s and was killed")
-            if status:
+                failed = f"the command did not end within {self.timeout:g} s and was stopped"
+            else:
                 how = f"was ended by {signal_name(-status)}" if status < 0 else f"ended with status {status}"
                 last = next((line.strip()[:300] for line in reversed(lines) if line.strip()), "nothing on stderr")
-                raise ExecutionError(f"the command {how}: {last}")
-            return _trajectory(folder, task)
+                failed = f"the command {how}: {last}"
+            try:
+                return replace(_trajectory(folder, task, failed=True), ended=failed)
+            except ExecutionError:  # nothing was recorded that can be used
+                raise ExecutionError(failed) from None
 
 
 def signal_name(number: int) -> str:
@@ -205,17 +225,19 @@ def signal_name(number: int) -> str:
     return f"signal {number}"
 
 
-def _trajectory(folder: Path, task: Task) -> Trajectory:
+def _trajectory(folder: Path, task: Task, failed: bool = False) -> Trajectory:
     shape = task.horizon + 1, task.initial_state.size
     with reworded("the command's trajectory cannot be used", InputError, OSError, MemoryError, to=ExecutionError):
         if os.path.lexists(folder / "trajectory.npz"):
-            trajectory = Trajectory.from_npz(folder / "trajectory.npz", shape=shape)
+            trajectory = Trajectory.from_npz(folder / "trajectory.npz", shape=None if failed else shape)
         elif os.path.lexists(folder / "trajectory.csv"):
             trajectory = Trajectory.from_csv(folder / "trajectory.csv", most_rows=shape[0])
         else:
             raise ExecutionError("the command ended well but wrote neither trajectory.npz nor trajectory.csv")
-        if trajectory.ended == COMPLETE:
-            if trajectory.states.shape != shape:
-                raise InputError(f"it must have states of shape {shape}, got {trajectory.states.shape}")
-            require_times(trajectory, task.times)
-    return trajectory
+        if failed or trajectory.ended != COMPLETE:
+            with contextlib.suppress(InputError):  # whoever keeps the steps before the failure checks them
+                return at_times(trajectory, task.times[: len(trajectory.times)])
+            return trajectory
+        if trajectory.states.shape != shape:
+            raise InputError(f"it must have states of shape {shape}, got {trajectory.states.shape}")
+        return at_times(trajectory, task.times)

@@ -6,7 +6,8 @@ reaper: a process that loses its parent becomes a child of this one, so that non
 children; the campaign's process may have some, so it cannot be the reaper. Nothing of ctxval is imported, and little
 else, because this file is started for every execution.
 
-Its arguments are the id of the campaign's process, the descriptors of the command's stdout and stderr, and the command.
+Its arguments are the id of the campaign's process, the descriptors of the command's stdout and stderr, the seconds that
+a command has to stop a rig after SIGTERM, and the command.
 It writes two lines: the id of the command's process, and, after all its processes have ended, the exit status, negative
 for a signal. Any input on stdin, or its end, means that the command must be ended.
 """
@@ -29,7 +30,7 @@ _LINUX = sys.platform.startswith("linux")
 
 def main() -> None:
     """Run the command, until it ends or must be ended."""
-    parent, stdout, stderr, *command = sys.argv[1:]
+    parent, stdout, stderr, grace, *command = sys.argv[1:]
     if _LINUX:
         ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
     woken, wake = os.pipe()
@@ -49,6 +50,11 @@ def main() -> None:
             break
         if ready:
             os.read(woken, 4096)
+    if child not in statuses:
+        _signal(_left(child), signal.SIGTERM)
+        deadline = time.monotonic() + float(grace)
+        while not _reap(statuses) and time.monotonic() < deadline:
+            time.sleep(0.005)
     _end(child, statuses)
     _say(str(os.waitstatus_to_exitcode(statuses[child])) if child in statuses else "lost")
 
@@ -57,7 +63,7 @@ def _spawn(command: list[str], stdout: int, stderr: int) -> int:
     files: list[tuple[Any, ...]] = [(os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0)]
     files += [(os.POSIX_SPAWN_DUP2, stdout, 1), (os.POSIX_SPAWN_DUP2, stderr, 2)]
     files += [(os.POSIX_SPAWN_CLOSE, stdout), (os.POSIX_SPAWN_CLOSE, stderr)]
-    ignored = [signal.SIGPIPE, signal.SIGXFSZ]  # by Python
+    ignored = [signal.SIGPIPE, signal.SIGXFSZ, signal.SIGTERM]  # by Python, or by who started the campaign
     return os.posix_spawnp(command[0], command, os.environ, file_actions=files, setpgroup=0, setsigdef=ignored)
 
 
@@ -85,21 +91,32 @@ def _end(child: int, statuses: dict[int, int]) -> None:
     spared: set[int] = set()
     attempts = 200  # if only processes are left that cannot be killed because they belong to another user
     while not _reap(statuses) and attempts:
-        left = _descendants(os.getpid()) if _LINUX else {-child}
+        left = _left(child)
         attempts -= left <= spared
-        for pid in left:
-            try:
-                os.kill(pid, signal.SIGKILL)
-            except ProcessLookupError:
-                pass
-            except PermissionError:
-                spared.add(pid)
+        spared |= _signal(left, signal.SIGKILL)
         time.sleep(0.005)
     if not _LINUX:
         try:
             os.killpg(child, signal.SIGKILL)
         except OSError:
             pass  # no process of the group is left
+
+
+def _left(child: int) -> set[int]:
+    return _descendants(os.getpid()) if _LINUX else {-child}
+
+
+def _signal(pids: set[int], number: int) -> set[int]:
+    """Signal processes; return those that belong to another user."""
+    spared = set()
+    for pid in pids:
+        try:
+            os.kill(pid, number)
+        except ProcessLookupError:
+            pass
+        except PermissionError:
+            spared.add(pid)
+    return spared
 
 
 def _descendants(ancestor: int) -> set[int]:

@@ -5,7 +5,6 @@ An ONNX file has double precision, for robots and other programs; it needs onnx 
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from ctxval._util.files import MADE_BY, write_text
 from ctxval._util.onnx_network import GraphValue, require_onnx
+from ctxval._util.toml import toml_text
 from ctxval.core.labels import units_of
 from ctxval.core.model import Model
 from ctxval.errors import InputError
@@ -58,23 +58,15 @@ def write_model_file(path: Path, model: Model, step: str | None = None) -> list[
     if isinstance(model, Parametric):
         if step is None:
             raise InputError(_NO_REFERENCE)
-        values = ", ".join(f"{name} = {value!r}" for name, value in model.theta.items())
-        dt = model.dt or getattr(model.data, "dt", None)
-        lines = [
-            f"# {MADE_BY}",
-            "[model]",
-            'type = "Parametric"',
-            f'step = {{ ref = "{step}" }}',
-            f"theta = {{ {values} }}",
-            *([] if dt is None else [f"dt = {dt!r}"]),
-            *(["vectorized = true"] if model.vectorized else []),
-            *(
-                f"{kind} = {_table(named)}"
-                for kind, named in zip(("states", "inputs"), units_of(model), strict=True)
-                if named
-            ),
-        ]
-        return [str(write_text(path, "\n".join([*lines, ""])))]
+        theta = {name: float(value) for name, value in model.theta.items()}
+        table: dict[str, Any] = {"type": "Parametric", "step": {"ref": step}, "theta": theta}
+        if (dt := model.dt or getattr(model.data, "dt", None)) is not None:
+            table["dt"] = float(dt)
+        if model.vectorized:
+            table["vectorized"] = True
+        named = zip(("states", "inputs"), units_of(model), strict=True)
+        table |= {kind: dict(names) for kind, names in named if names}
+        return [str(write_text(path, f"# {MADE_BY}\n{toml_text({'model': table})}"))]
     if path.suffix == ".npz":
         write_model(path, model)
         return [str(path)]
@@ -84,11 +76,6 @@ def write_model_file(path: Path, model: Model, step: str | None = None) -> list[
         return [str(path)]
     write_transitions(beside, data)
     return [str(path), str(beside)]
-
-
-def _table(named: dict[str, str]) -> str:
-    """Return names with their units as a table of TOML."""
-    return f"{{ {', '.join(f'{json.dumps(name)} = {json.dumps(unit)}' for name, unit in named.items())} }}"
 
 
 def write_onnx(path: str | Path, model: Model) -> None:
