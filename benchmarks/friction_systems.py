@@ -221,8 +221,8 @@ def with_seals(
         return push(q, w, u) / 1.05
 
     dt, places = 0.04, tuple(range(inputs))
-    limits = (np.asarray(each) for each in (sliding, rest, rest if back is None else back))
-    joints = sealed(heavier, *limits, dt, detent=detent)
+    to_rest, to_rest_back = np.asarray(rest), np.asarray(rest if back is None else back)
+    joints = sealed(heavier, np.asarray(sliding), to_rest, to_rest_back, dt, detent=detent)
     return pair(name, units, space, joints, push, 60, dt, Q, R, places, inputs)
 
 

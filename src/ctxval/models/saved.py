@@ -83,7 +83,8 @@ def stored_transitions(arrays: Archive) -> Transitions | None:
         return None
     x, u, x_next = (arrays.numbers(name) for name in _DATA)
     named = names_in(arrays.text("names")) if "names" in arrays.names else {}
-    return Transitions(x, u, x_next, float(arrays.numbers("dt")) if "dt" in arrays.names else None, **named)
+    dt = float(arrays.numbers("dt")) if "dt" in arrays.names else None
+    return Transitions(x, u, x_next, dt, states=named.get("states", {}), inputs=named.get("inputs", {}))
 
 
 def names_as_text(data: object) -> str:

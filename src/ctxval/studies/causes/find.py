@@ -292,9 +292,9 @@ class _Study:
         worth = [result for result in results[:_FITTED] if result[0] <= 0.25 * results[0][0]]
         refined = [explained(self.evidence, together, begun) for _, begun, together in worth or results[:1]]
         distinct = list[Explanation]()
-        for each in sorted(refined, key=lambda explanation: explanation.criterion):
-            if not any(_is_same(each, other) for other in distinct):
-                distinct.append(each)
+        for explanation in sorted(refined, key=lambda each: each.criterion):
+            if not any(_is_same(explanation, other) for other in distinct):
+                distinct.append(explanation)
         return distinct
 
     def _chosen(self, ranked: list[Explanation]) -> tuple[Explained | None, list[Explained]]:
