@@ -25,7 +25,7 @@ GRAVITY = 9.81
 def quadrotor(seed: int) -> Experiment:
     """Return a quadrotor in a vertical plane with drag, which nominal physics do not know. 12-D, M without data."""
     dt, horizon = 0.05, 60
-    lift, torque = np.random.default_rng([seed, 11]).uniform(0.96, 1.04, 2)
+    nominal = np.random.default_rng([seed, 11]).uniform(0.96, 1.04, 2)
 
     def derivative(lift: float, torque: float, drag: float, x: Array, u: Array) -> Array:
         tilt, speed = x[..., 2], x[..., 3:5]
@@ -59,7 +59,7 @@ def quadrotor(seed: int) -> Experiment:
         ),
         task=fly,
         system=simulated(partial(derivative, 1.0, 1.0, 0.25), dt),
-        model=simulated(partial(derivative, lift, torque, 0.0), dt).model,
+        model=simulated(partial(derivative, *nominal, 0.0), dt).model,  # type: ignore[call-arg]
         synthesizer=controllers.Policy(_fly),
         distance=distances.WholeTrajectory(components=(0, 1)),
     )
@@ -109,7 +109,7 @@ def ball_on_beam(seed: int) -> Experiment:
 def reactor(seed: int) -> Experiment:
     """Return an exothermic stirred tank (Uppal et al. 1974), cooled by nominal chemistry. 3-D, M without data."""
     dt, horizon = 0.1, 40
-    fast, hot = np.random.default_rng([seed, 13]).uniform([0.9, 0.9], [1.1, 1.1])
+    nominal = tuple(np.random.default_rng([seed, 13]).uniform([0.9, 0.9], [1.1, 1.1]))
 
     def derivative(rate: float, heat: float, x: Array, u: Array) -> Array:
         warmth = x[..., 1]
@@ -120,7 +120,7 @@ def reactor(seed: int) -> Experiment:
         )
 
     def hold(t: int, x: Array, task: Task) -> Array:
-        drift = derivative(fast, hot, x, np.zeros((*x.shape[:-1], 1)))[..., 1]
+        drift = derivative(*nominal, x, np.zeros((*x.shape[:-1], 1)))[..., 1]  # type: ignore[call-arg]
         return np.asarray(((3.0 * (task.goal[..., 1] - x[..., 1]) - drift) / 0.6)[..., None])
 
     return experiment(
@@ -129,7 +129,7 @@ def reactor(seed: int) -> Experiment:
         space=TaskSpace(conversion=(0.05, 0.6), temperature=(0, 3), goal=(0.5, 3.5)),
         task=lambda p: Task([p.conversion, p.temperature], goal=[0.5, p.goal], horizon=horizon, dt=dt),
         system=simulated(partial(derivative, 1.0, 1.0), dt),
-        model=simulated(partial(derivative, fast, hot), dt).model,
+        model=simulated(partial(derivative, *nominal), dt).model,
         synthesizer=controllers.Policy(hold, limits=6.0),
         distance=distances.WholeTrajectory(),
     )

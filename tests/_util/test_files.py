@@ -24,7 +24,6 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 from ctxval import Trajectory
 from ctxval._util import files
-from ctxval._util.columns import CsvTable
 from ctxval._util.files import (
     LOCKS_FILE_ITSELF,
     Archive,
@@ -36,6 +35,7 @@ from ctxval._util.files import (
     require_regular_file,
     written_whole,
 )
+from ctxval._util.tables import CsvTable
 from ctxval.cli.config.parts import recorded
 from ctxval.core.exchange import read_task
 from ctxval.errors import InputError, ShapeError
@@ -124,8 +124,6 @@ def test_rows_have_the_numbers_of_their_lines(tmp_path: Path) -> None:
     ("content", "reason"),
     [
         (b"t,x0\n0,1\0\n", "NUL bytes"),
-        ("t,x0\n0,1\n".encode("utf-16"), "codec can't decode"),
-        ("t,x0\n0,1\n".encode("utf-16-le"), "NUL bytes"),
         (b"," * (2**20 + 1), "a row of more than 1048576 characters"),
         (b'"\n",' * 400_000, "a row of more than 1048576 characters"),
         (b"t,x0\n0," + b"1" * 200_000, "field limit"),
@@ -155,7 +153,7 @@ def test_more_rows_than_a_plan_has_are_not_read(tmp_path: Path) -> None:
 
 def test_numbers_of_csv_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.csv").write_text("t,x0\n" + "0,1\n" * 100)
-    monkeypatch.setattr("ctxval._util.columns.MOST_BYTES", 1000)
+    monkeypatch.setattr("ctxval._util.tables.MOST_BYTES", 1000)
     with pytest.raises(InputError, match="too many numbers: 1000 bytes may be read"):
         Trajectory.from_csv(tmp_path / "a.csv")
 

@@ -260,7 +260,8 @@ def unexplained(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
     """Yield which executions the law that all of them teach does not explain, and which differ as they should not."""
     silent = [each for each in evidence.executed if not each.quantiles]
     farthest = max(silent, key=lambda each: abs(each.distance - each.expected), default=None)
-    if farthest is not None and not agrees(farthest.distance, farthest.expected, bound):
+    tolerated = max(ACCURATE * bound, evidence.negligible)
+    if farthest is not None and abs(farthest.distance - farthest.expected) > tolerated:
         yield sentences.UNEXPLAINED.format(**vars(farthest))
     against = evidence_against(evidence.executed)
     if against > CONTRADICTED and (least := least_explained(evidence.executed)) is not None:

@@ -16,7 +16,7 @@ from ctxval._util.texts import parted
 from ctxval.core.coverage import StateInputCoverage, StatePocket, UntriedParameter
 from ctxval.core.labels import labels_of
 from ctxval.core.learned_numbers import PushedDistances
-from ctxval.core.model import Model
+from ctxval.core.model import Model, predicted_steps, with_memory
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import AnyPosterior, Loops, distances_of, loop_pairs
 from ctxval.learning.coverage import (
@@ -127,9 +127,8 @@ class LearnedDynamics(ShortRepr):
 
     def _errors_of(self, models: Sequence[Model]) -> Array:
         loops = self.trajectories_of_system
-        errors = [
-            m.step(loop.states[:-1], loop.inputs) - loop.states[1:] for m, loop in zip(models, loops, strict=True)
-        ]
+        steps = [predicted_steps(m, with_memory(m, loop)) for m, loop in zip(models, loops, strict=True)]
+        errors = [predicted - loop.states[1:] for predicted, loop in zip(steps, loops, strict=True)]
         return np.asarray(np.sqrt((np.concatenate(errors) ** 2).mean(axis=0)))
 
     @functools.cached_property

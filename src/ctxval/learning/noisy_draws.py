@@ -82,6 +82,11 @@ class NoisyDraws(Draws):
         of_runs = None if self.of_runs is None else self.of_runs[:, :replicates]
         return replace(self, rows=self.rows[:, :replicates], start=self.start[:, :replicates], of_runs=of_runs)
 
+    @property
+    def of_steps(self) -> Self:
+        """The same with the sequences of independent steps alone."""
+        return replace(self, rows=self.rows[:, :: self.kinds], start=self.start[:, :: self.kinds], of_runs=None)
+
     def settled(self, rng: np.random.Generator) -> Self:
         """Return the same residuals with many other sequences of noise."""
         if self.replicates == 1:
@@ -215,8 +220,8 @@ class NoisyPosterior(ShortRepr):
         return self.mean.searched
 
     def with_noise(self, runs: int, least: Array) -> NoisyDraws | None:
-        """Return the mean; None if all deviations are at most those that are given, ``(n,)``."""
-        return self.mean if ((self.fit.noise > least) | (self.scatter > least)).any() else None
+        """Return the mean with noise in steps; None if all deviations are at most those that are given, ``(n,)``."""
+        return self.mean.of_steps if ((self.fit.noise > least) | (self.scatter > least)).any() else None
 
     def draw(
         self,
