@@ -72,6 +72,7 @@ def test_marks_of_missing_values_are_a_break(token: str, tmp_path: Path) -> None
         ((1, 1), "12:03:04", "line 2: angle must be a number, got '12:03:04'"),
         ((1, 1), "2024-05-01T12:00:00", "line 2: angle must be a number, got '2024-05-01T12:00:00'"),
         ((9, 2), "1_0", "line 10: speed must be a number, got '1_0'"),
+        ((9, 2), "\u0661\u0662", "line 10: speed must be a number, got '\u0661\u0662'"),
         ((9, 2), '"1,234"', "line 10: speed must be a number, got '1,234'"),
         ((9, 2), '"0,5"', "has decimal commas (line 10) and points (line 2)"),
         ((60, 0), "late", "line 61: t must be a number, got 'late'"),

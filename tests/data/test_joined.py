@@ -135,3 +135,13 @@ def test_matrices_of_a_to_file_block_and_structures_with_time_are_read(times: np
         column = int(fields[2][-1]) - (name == "a")
         expected = np.interp(run.start + run.trajectory.times, times, RATES[:, column])
         np.testing.assert_allclose(run.trajectory.states[:, 0], expected, atol=1e-3)
+
+
+def test_times_of_several_files_are_measured_as_those_of_one(tmp_path: Path) -> None:
+    for name, times, values in (("run_pos", FAST, np.sin(FAST)), ("run_vel", FAST, np.cos(FAST))):
+        rows = [f"{1000 * time:.0f},{value}" for time, value in zip(times, values, strict=True)]
+        (tmp_path / f"{name}.csv").write_text("\n".join([f"t,{'angle' if 'pos' in name else 'speed'}", *rows]))
+    mapping = LogMapping.from_table({"states": {"angle": "angle", "speed": "speed"}, "inputs": {}})
+    with pytest.raises(InputError, match=r"as if t were in ms: a step would take 0\.004 s instead of 4 s"):
+        read_recordings([tmp_path], mapping)
+    assert read_recordings([tmp_path], mapping, time_unit="ms").dt == 0.004

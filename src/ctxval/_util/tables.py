@@ -27,7 +27,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.columns import is_unit, named_unit, require_distinct
 from ctxval._util.files import MOST_BYTES, open_regular
 from ctxval._util.refusals import reworded
-from ctxval._util.texts import unguarded
+from ctxval._util.texts import number_in, unguarded
 from ctxval.errors import InputError
 
 MOST_ROW = 2**20  # largest number of characters in a row
@@ -39,7 +39,7 @@ _MARKS = (
     "-nan nan(ind) -nan(ind) 1.#ind -1.#ind 1.#qnan -1.#qnan 1.#snan -1.#snan 1.#inf -1.#inf"
 )
 _MISSING = frozenset(_MARKS.split())
-_NUMBER = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?")
+_NUMBER = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?", re.ASCII)
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
 _MOMENT = re.compile(
     r"(?:(?P<day>\d{1,4}([-/.])\d{1,2}\2\d{1,4})[T ,]+)?(?:(?P<h>\d{1,3}):)?(?P<m>\d{1,2}):(?P<s>\d\d)"
@@ -164,9 +164,9 @@ class CsvTable:
     def number(self, line: int, name: str, cell: str) -> float:
         mark = "," if "," in cell else "." if "." in cell else ""
         try:
-            if "_" in cell or (mark == self._layout.separator and _THOUSANDS.fullmatch(cell.strip())):
+            if mark == self._layout.separator and _THOUSANDS.fullmatch(cell.strip()):
                 raise ValueError
-            value = float(cell.replace(",", ".") if mark == "," else cell)
+            value = number_in(cell.replace(",", ".").strip() if mark == "," else cell.strip(), float)
         except ValueError:
             shown = f"got {cell[:60]!r}" if cell.strip() else "and the cell is empty"
             raise InputError(f"{self.path}, line {line}: {name} must be a number, {shown}.") from None

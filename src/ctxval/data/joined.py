@@ -45,9 +45,12 @@ class JoinedLog(Log):
     def fields(self) -> tuple[str, ...]:
         return tuple(self._known)
 
+    def numbered_times(self, clock: Clock) -> tuple[str, str] | None:
+        return next(iter(self._tables.values())).numbered_times(self._in_unit(clock))
+
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
         located = {field: self._located(field, self._place) for field in fields}
-        clock = replace(clock, unit=clock.unit or self._unit)
+        clock = self._in_unit(clock)
         names = {field: name if k is None else f"{name}[{k}]" for field, ((_, name), k) in located.items()}
         signals = dict[str, Signal]()
         for topic in dict.fromkeys(topic for (topic, _), _ in located.values()):
@@ -55,6 +58,9 @@ class JoinedLog(Log):
             read = self._tables[topic].signals([names[field] for field in of_topic], clock)
             signals |= {field: read[names[field]] for field in of_topic}
         return {field: signals[field] for field in fields}
+
+    def _in_unit(self, clock: Clock) -> Clock:
+        return replace(clock, unit=clock.unit or self._unit)
 
     def _place(self, field: str) -> tuple[str, str] | None:
         """Return the topic and the name of a field, with or without its unit."""
