@@ -145,3 +145,17 @@ def test_times_of_several_files_are_measured_as_those_of_one(tmp_path: Path) -> 
     with pytest.raises(InputError, match=r"as if t were in ms: a step would take 0\.004 s instead of 4 s"):
         read_recordings([tmp_path], mapping)
     assert read_recordings([tmp_path], mapping, time_unit="ms").dt == 0.004
+
+
+@pytest.mark.parametrize("first", ["12:00:00", "23:59:59"])
+def test_dates_in_several_files_are_on_one_clock(first: str, tmp_path: Path) -> None:
+    start = np.datetime64(f"2024-03-09T{first}.000")
+    for name, times in (("run_fast", FAST), ("run_slow", 1.2 + SLOW[:8])):  # the second begins later
+        rows = [f"{start + np.timedelta64(round(1000 * time), 'ms')},{time}" for time in times]
+        (tmp_path / f"{name}.csv").write_text("\n".join([f"time,{name[4:]}", *rows]))
+    mapping = LogMapping.from_table({"states": {"x": "fast"}, "inputs": {"u": "slow"}})
+    run = read_recordings([tmp_path], mapping).runs[0].trajectory
+    ahead = run.states[:-1, 0] - run.inputs[:, 0]  # the input is held
+    assert run.horizon > 100
+    assert (ahead > -1e-6).all()
+    assert (ahead[:150] < 0.1).all()

@@ -141,7 +141,7 @@ class CsvTable:
         return np.array([row[place].strip() for _, row in self.rows()])
 
     def clock_times(self, name: str) -> Array | None:
-        """Return the seconds since the first time of a column with dates or clock times; None if it has numbers."""
+        """Return the seconds since midnight before the first of dates or clock times in a column; None for numbers."""
         place, times, days = self.names.index(name), array("d"), array("d")
         for line, row in self.rows():
             cell = row[place]
@@ -159,7 +159,7 @@ class CsvTable:
         if not dates[known].all():  # there are clock times without a date, which go on over midnight
             seconds[known] = np.unwrap(seconds[known], period=86400.0)
         # Seconds since 1970 would be rounded to 0.2 microseconds.
-        return np.asarray(86400.0 * (dates - dates[known][0]) + (seconds - seconds[known][0]))
+        return np.asarray(86400.0 * (dates - dates[known][0]) + seconds)
 
     def number(self, line: int, name: str, cell: str) -> float:
         mark = "," if "," in cell else "." if "." in cell else ""

@@ -57,6 +57,11 @@ class JoinedLog(Log):
             of_topic = [field for field, ((each, _), _) in located.items() if each == topic]
             read = self._tables[topic].signals([names[field] for field in of_topic], clock)
             signals |= {field: read[names[field]] for field in of_topic}
+        if self.numbered_times(clock) is None:  # dates count from midnight: tables begin within half a day
+            start = signals[fields[0]].times[0]
+            for field, signal in signals.items():
+                days = round((signal.times[0] - start) / 86400)
+                signals[field] = replace(signal, times=signal.times - 86400 * days)
         return {field: signals[field] for field in fields}
 
     def _in_unit(self, clock: Clock) -> Clock:
