@@ -136,8 +136,9 @@ def survey(
     used = _time_of(first, clock)
     evidence = [_evidence(logs[:20], path, clock) for path in first.fields() if path != used]
     reasons = {each.remark if isinstance(each, FieldSummary) else "" for each in evidence}
-    if len(reasons) == 1 and (reason := reasons.pop()):  # no times, for example
-        raise InputError(f"{first.source} {reason}.")
+    if len(reasons) == 1 and "" not in reasons:  # there are no times, for example: that error is the answer
+        for log in logs[:20]:
+            log.signals([evidence[0].path], clock)
     summaries = [_summary(each) if isinstance(each, Evidence) else each for each in evidence]
     if mapping is None:
         moving = [each for each in evidence if isinstance(each, Evidence) and _summary(each).moves]
