@@ -135,3 +135,27 @@ def test_matrices_of_a_to_file_block_and_structures_with_time_are_read(times: np
         column = int(fields[2][-1]) - (name == "a")
         expected = np.interp(run.start + run.trajectory.times, times, RATES[:, column])
         np.testing.assert_allclose(run.trajectory.states[:, 0], expected, atol=1e-3)
+
+
+def test_times_of_several_files_are_measured_as_those_of_one(tmp_path: Path) -> None:
+    for name, times, values in (("run_pos", FAST, np.sin(FAST)), ("run_vel", FAST, np.cos(FAST))):
+        rows = [f"{1000 * time:.0f},{value}" for time, value in zip(times, values, strict=True)]
+        (tmp_path / f"{name}.csv").write_text("\n".join([f"t,{'angle' if 'pos' in name else 'speed'}", *rows]))
+    mapping = LogMapping.from_table({"states": {"angle": "angle", "speed": "speed"}, "inputs": {}})
+    with pytest.raises(InputError, match=r"as if t were in ms: a step would take 0\.004 s instead of 4 s"):
+        read_recordings([tmp_path], mapping)
+    assert read_recordings([tmp_path], mapping, time_unit="ms").dt == 0.004
+
+
+@pytest.mark.parametrize("first", ["12:00:00", "23:59:59"])
+def test_dates_in_several_files_are_on_one_clock(first: str, tmp_path: Path) -> None:
+    start = np.datetime64(f"2024-03-09T{first}.000")
+    for name, times in (("run_fast", FAST), ("run_slow", 1.2 + SLOW[:8])):  # the second begins later
+        rows = [f"{start + np.timedelta64(round(1000 * time), 'ms')},{time}" for time in times]
+        (tmp_path / f"{name}.csv").write_text("\n".join([f"time,{name[4:]}", *rows]))
+    mapping = LogMapping.from_table({"states": {"x": "fast"}, "inputs": {"u": "slow"}})
+    run = read_recordings([tmp_path], mapping).runs[0].trajectory
+    ahead = run.states[:-1, 0] - run.inputs[:, 0]  # the input is held
+    assert run.horizon > 100
+    assert (ahead > -1e-6).all()
+    assert (ahead[:150] < 0.1).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from ctxval._util.arrays import Array
 from ctxval.core.trajectory import Trajectory
-from ctxval.data import LogMapping, MemoryTable, Recordings, recordings_of
+from ctxval.data import LogMapping, MemoryTable, Recordings, read_recordings, recordings_of
 from ctxval.data.rates import Column, rate_pairs
 from ctxval.errors import InputError
 
@@ -172,3 +173,15 @@ def test_the_ratio_follows_every_change_of_a_scale(angle: float, rate: float, ti
     (pair,) = rate_pairs([run], [Column("angle"), Column("rate"), Column("voltage", of_input=True)], time * DT)
     assert pair.ratio == pytest.approx(angle / rate / time, rel=0.01)
     assert pair.correlation > 0.99
+
+
+def test_dates_state_their_times_and_numbers_of_the_same_times_do_not(tmp_path: Path) -> None:
+    moments = np.datetime64("2024-03-09T23:50:00") + 10 * np.arange(100)
+    x = np.cumsum(np.random.default_rng(3).normal(size=100))
+    for name, times in (("dates", moments), ("numbers", 10 * np.arange(100))):
+        rows = [f"{time},{angle},{k // 10}" for k, (time, angle) in enumerate(zip(times, x, strict=True))]
+        (tmp_path / f"{name}.csv").write_text("\n".join(["time,angle,voltage", *rows]))
+    mapping = LogMapping.from_table({"states": {"angle": "angle"}, "inputs": {"u": "voltage"}})
+    assert read_recordings([tmp_path / "dates.csv"], mapping).dt == 10
+    with pytest.raises(InputError, match="with time in s, a step takes 10 s"):
+        read_recordings([tmp_path / "numbers.csv"], mapping)

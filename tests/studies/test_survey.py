@@ -84,10 +84,23 @@ def test_a_rate_that_is_not_recorded_is_derived_and_every_guess_is_said(tmp_path
     assert roles(found) == {"kp": "", "position": "state", "goal_force": "input", "temp": ""}
     assert list(found.recordings.states) == ["position", "position rate"]
     said = " ".join(found.guesses)
-    assert "not used: kp, temp" in said or "not used: temp, kp" in said
+    assert "not used: kp (it has one value in each file), temp (" in said
     assert "no rate is recorded" in said
     assert any("looks 0.15 s ahead" in note for note in found.recordings.notes)
     assert {field.path: field.remark for field in found.fields}["kp"] == "it has one value in each file"
+
+
+def test_a_rate_is_found_by_its_records_if_no_name_tells(tmp_path: Path) -> None:
+    rng, rows, x, v, u = np.random.default_rng(2), list[str](), 0.0, 0.0, 0.0
+    for k in range(400):
+        u = rng.uniform(-3, 3) if k % 12 == 0 else u
+        rows.append(f"{0.02 * k:.2f},{x:.9f},{v:.9f},{u}")
+        x, v = x + 0.02 * v + 0.0016 * u, v + 0.02 * (8 * u - 2 * v)
+    (tmp_path / "run.csv").write_text("\n".join(["time,ans1,ans2,ans3", *rows]))
+    found = survey([tmp_path / "run.csv"])
+    assert list(found.recordings.states) == ["ans1", "ans2"]
+    assert "ans2 changes as the rate of ans1 does" in found.guesses
+    assert found.reach[1] == found.reach[2]
 
 
 def test_an_angle_that_jumps_is_continued(tmp_path: Path) -> None:
@@ -132,6 +145,16 @@ def test_logs_without_a_state_are_refused(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text("time,force,temp\n0,1,2\n1,2,3\n2,1,4\n")
     with pytest.raises(InputError, match="no field that looks like a state"):
         survey([tmp_path / "run.csv"])
+    rows = [f"{0.1 * k:.1f},{'12:03:04' if k == 3 else k},{k % 3}" for k in range(9)]
+    (tmp_path / "cell.csv").write_text("\n".join(["time,angle,voltage", *rows]))
+    with pytest.raises(InputError, match=r"angle \(line 5: angle must be a number, got '12:03:04'\)"):
+        survey([tmp_path / "cell.csv"])
+    (tmp_path / "untimed.csv").write_text("yEst,uEst\n1,2\n2,3\n")
+    with pytest.raises(InputError, match=r"untimed.csv has no column of times"):
+        survey([tmp_path / "untimed.csv"])
+    (tmp_path / "units.csv").write_text("time_ms,x,u\n1,2,3\n2,3,4\n")
+    with pytest.raises(InputError, match=r"states the times of time_ms in ms: rename it if its times are in s"):
+        survey([tmp_path / "units.csv"], time="time_ms [s]")
     (tmp_path / "still.csv").write_text("time,x0,u0\n0,1,0\n1,1,1\n2,1,0\n3,1,1\n")
     with pytest.raises(InputError, match=r"no state ever changes in the logs \(x0\)"):
         survey([tmp_path / "still.csv"])

@@ -27,7 +27,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.columns import is_unit, named_unit, require_distinct
 from ctxval._util.files import MOST_BYTES, open_regular
 from ctxval._util.refusals import reworded
-from ctxval._util.texts import unguarded
+from ctxval._util.texts import number_in, unguarded
 from ctxval.errors import InputError
 
 MOST_ROW = 2**20  # largest number of characters in a row
@@ -39,7 +39,7 @@ _MARKS = (
     "-nan nan(ind) -nan(ind) 1.#ind -1.#ind 1.#qnan -1.#qnan 1.#snan -1.#snan 1.#inf -1.#inf"
 )
 _MISSING = frozenset(_MARKS.split())
-_NUMBER = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?")
+_NUMBER = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?", re.ASCII)
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
 _MOMENT = re.compile(
     r"(?:(?P<day>\d{1,4}([-/.])\d{1,2}\2\d{1,4})[T ,]+)?(?:(?P<h>\d{1,3}):)?(?P<m>\d{1,2}):(?P<s>\d\d)"
@@ -141,7 +141,7 @@ class CsvTable:
         return np.array([row[place].strip() for _, row in self.rows()])
 
     def clock_times(self, name: str) -> Array | None:
-        """Return the seconds since the first time of a column with dates or clock times; None if it has numbers."""
+        """Return the seconds since midnight before the first of dates or clock times in a column; None for numbers."""
         place, times, days = self.names.index(name), array("d"), array("d")
         for line, row in self.rows():
             cell = row[place]
@@ -159,14 +159,14 @@ class CsvTable:
         if not dates[known].all():  # there are clock times without a date, which go on over midnight
             seconds[known] = np.unwrap(seconds[known], period=86400.0)
         # Seconds since 1970 would be rounded to 0.2 microseconds.
-        return np.asarray(86400.0 * (dates - dates[known][0]) + (seconds - seconds[known][0]))
+        return np.asarray(86400.0 * (dates - dates[known][0]) + seconds)
 
     def number(self, line: int, name: str, cell: str) -> float:
         mark = "," if "," in cell else "." if "." in cell else ""
         try:
-            if "_" in cell or (mark == self._layout.separator and _THOUSANDS.fullmatch(cell.strip())):
+            if mark == self._layout.separator and _THOUSANDS.fullmatch(cell.strip()):
                 raise ValueError
-            value = float(cell.replace(",", ".") if mark == "," else cell)
+            value = number_in(cell.replace(",", ".").strip() if mark == "," else cell.strip(), float)
         except ValueError:
             shown = f"got {cell[:60]!r}" if cell.strip() else "and the cell is empty"
             raise InputError(f"{self.path}, line {line}: {name} must be a number, {shown}.") from None

@@ -13,7 +13,7 @@ import numpy as np
 from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.progress import advance, stage
 from ctxval._util.refusals import reworded
-from ctxval._util.representation import task_text
+from ctxval._util.representation import counted, task_text
 from ctxval._util.tables import CsvTable
 from ctxval._util.texts import shell_word
 from ctxval._util.toml import require_unedited, write_toml
@@ -195,7 +195,8 @@ def start(logs: list[Path], reading: Logs, out_: Path = Path("start"), force: bo
 def _print_survey(result: Survey) -> None:
     recordings = result.recordings
     steps = f"{recordings.steps} steps of {recordings.dt:g} s"
-    out.say(f"{len(result.sources)} logs, {len(recordings.runs)} recordings, {steps}")
+    logs, runs = counted(len(result.sources), "log"), counted(len(recordings.runs), "recording")
+    out.say(f"{logs}, {runs}, {steps}")
     rows = []
     for field in result.fields[:24]:
         every = f"{field.period:.3g} s" if field.period else "-"

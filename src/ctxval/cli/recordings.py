@@ -10,7 +10,7 @@ from typing import Any, get_args
 from ctxval._util.files import read_toml
 from ctxval._util.onnx_network import require_onnx
 from ctxval._util.refusals import reworded
-from ctxval._util.representation import task_text
+from ctxval._util.representation import counted, task_text
 from ctxval._util.texts import shortened
 from ctxval.cli import base
 from ctxval.cli.base import command, err, named_values, notes, out, print_columns, require_outputs
@@ -163,7 +163,9 @@ def replay(
 
 def _print_replay(report: ReplayReport, units: str) -> None:
     data = report.data
-    out.say(f"{data.recordings} recordings, {data.steps} steps of {data.dt:g} s ({data.steps * data.dt:.4g} s)")
+    out.say(
+        f"{counted(data.recordings, 'recording')}, {data.steps} steps of {data.dt:g} s ({data.steps * data.dt:.4g} s)"
+    )
     out.say(f"states: {', '.join(data.states)}; inputs: {', '.join(data.inputs) or 'none'}")
     print_breaks(report.data)
     errors = sorted(report.errors, key=lambda error: list(data.states).index(error.state))

@@ -45,16 +45,27 @@ class JoinedLog(Log):
     def fields(self) -> tuple[str, ...]:
         return tuple(self._known)
 
+    def numbered_times(self, clock: Clock) -> tuple[str, str] | None:
+        return next(iter(self._tables.values())).numbered_times(self._in_unit(clock))
+
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
         located = {field: self._located(field, self._place) for field in fields}
-        clock = replace(clock, unit=clock.unit or self._unit)
+        clock = self._in_unit(clock)
         names = {field: name if k is None else f"{name}[{k}]" for field, ((_, name), k) in located.items()}
         signals = dict[str, Signal]()
         for topic in dict.fromkeys(topic for (topic, _), _ in located.values()):
             of_topic = [field for field, ((each, _), _) in located.items() if each == topic]
             read = self._tables[topic].signals([names[field] for field in of_topic], clock)
             signals |= {field: read[names[field]] for field in of_topic}
+        if self.numbered_times(clock) is None:  # dates count from midnight: tables begin within half a day
+            start = signals[fields[0]].times[0]
+            for field, signal in signals.items():
+                days = round((signal.times[0] - start) / 86400)
+                signals[field] = replace(signal, times=signal.times - 86400 * days)
         return {field: signals[field] for field in fields}
+
+    def _in_unit(self, clock: Clock) -> Clock:
+        return replace(clock, unit=clock.unit or self._unit)
 
     def _place(self, field: str) -> tuple[str, str] | None:
         """Return the topic and the name of a field, with or without its unit."""

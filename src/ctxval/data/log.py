@@ -83,6 +83,10 @@ class Log(ShortRepr, ABC):
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
         """Return fields over time by their names; ``name[2]`` is one component of a vector."""
 
+    def numbered_times(self, clock: Clock) -> tuple[str, str] | None:
+        """Return the column of numbers that are the times, and its unit, empty if not stated; None without one."""
+        return None
+
     def episodes(self, used: Sequence[str]) -> list[Log]:
         """Return the recordings in this log, one for each number in a column such as ``episode``."""
         return [self]
@@ -135,6 +139,11 @@ class Table(Log):
     def has(self, field: str) -> bool:
         """Return whether a column is meant by a field, with or without its unit."""
         return column_of(self.source, self.names, field) is not None
+
+    def numbered_times(self, clock: Clock) -> tuple[str, str] | None:
+        name, unit = self._time(clock)
+        dated = name is not None and self.clock is not None and self.clock(name) is not None
+        return None if name is None or dated else (name, unit)
 
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
         require_distinct(self.source, self.names)
@@ -216,6 +225,10 @@ class Table(Log):
         if clock.field is not None:
             column = column_of(self.source, self.names, clock.field)
             if column is None:
+                plain, stated, _ = named_unit(clock.field)
+                if stated and (column := column_of(self.source, self.names, plain)) is not None:
+                    how = f"rename it if its times are in {stated}"
+                    raise InputError(f"{self.source} states the times of {column[0]} in {column[1]}: {how}.")
                 raise self.missing(clock.field)
         elif clock.period is not None:
             return None, ""

@@ -89,11 +89,11 @@ class Clocked:
     confirmed: bool = False  #: whether the user or the format states the unit, or the user states the time step
 
     @staticmethod
-    def of(column: str, unit: str, mapped: str, *, stated: bool) -> Clocked:
-        """Return the clock of a column with the unit of its name, or of the mapping; ``stated`` if a step is stated."""
-        in_header, factor = bool(named_unit(column)[1]), _factor(unit or mapped or "s", "s")
+    def of(column: str, unit: str, *, stated: bool) -> Clocked:
+        """Return the clock of a column whose unit its name or the user states; ``stated`` if a step is stated."""
+        in_header, factor = bool(named_unit(column)[1]), _factor(unit or "s", "s")
         name = next((name for name, seconds in _TIMES.items() if factor == seconds), "s")
-        return Clocked(column, name, in_header, stated or (bool(unit or mapped) and not in_header))
+        return Clocked(column, name, in_header, stated or (bool(unit) and not in_header))
 
     def advice(self, *units: str) -> str:
         """Return how to state that the times are in one of these units."""

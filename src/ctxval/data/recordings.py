@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
-from ctxval._util.columns import FAR, column_of, conversion, sentinels, time_column, unit_advice
+from ctxval._util.columns import FAR, conversion, sentinels, time_column, unit_advice
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr, call, counted
@@ -20,7 +20,7 @@ from ctxval.core.controller import Controller
 from ctxval.core.plan import input_difference, inputs_along
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, Transitions
-from ctxval.data.log import Log, Signal, Table
+from ctxval.data.log import Clock, Log, Signal, Table
 from ctxval.data.mapping import LogMapping, Observer
 from ctxval.data.rates import Clocked, Column, require_scale
 from ctxval.data.readers import component_names, logs_in, read_logs
@@ -135,19 +135,20 @@ def _scale_notes(runs: Sequence[Recording], channels: Sequence[Channel], dt: flo
 
 
 def _clocked(log: Log, mapping: LogMapping) -> Clocked:
-    """Return in which unit the times of a log are taken, and who states it."""
-    if not isinstance(log, Table):
-        return Clocked()  # messages have times in nanoseconds
-    where = log.source, log.fields()
-    column = time_column(*where) if mapping.time is None else column_of(*where, mapping.time)
-    return Clocked() if column is None else Clocked.of(*column, mapping.time_unit, stated=mapping.dt is not None)
+    """Return in which unit the times of a log are taken, and who states it; messages and dates state it themselves."""
+    times = log.numbered_times(_clock(log, mapping))
+    return Clocked() if times is None else Clocked.of(*times, stated=mapping.dt is not None)
+
+
+def _clock(log: Log, mapping: LogMapping) -> Clock:
+    """Return the clock of a mapping; rows of a table without times have equal steps."""
+    timed = mapping.clock.field is not None or not isinstance(log, Table) or time_column(log.source, log.fields())
+    return mapping.clock if timed else replace(mapping.clock, period=mapping.dt)
 
 
 def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], notes: list[str]) -> list[Channel]:
     """Return the components of all states and inputs over time; sentences on how they were read are added to notes."""
-    clock, condition = mapping.clock, mapping.condition
-    if clock.field is None and isinstance(log, Table) and time_column(log.source, log.fields()) is None:
-        clock = replace(clock, period=mapping.dt)
+    clock, condition = _clock(log, mapping), mapping.condition
     paths = [field.path for field in mapping.fields.values()]
     signals = log.signals([*paths, *([condition[0]] if condition else [])], clock)
     notes += log.remarks

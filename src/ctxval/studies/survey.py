@@ -21,8 +21,9 @@ from ctxval._util.describe import plain_json
 from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.texts import enumerated
 from ctxval.core.model import Model
+from ctxval.core.trajectory import Trajectory
 from ctxval.data import Clock, Field, Log, LogMapping, Recordings, Table, component_names, read_logs, recordings_of
-from ctxval.data.rates import Column
+from ctxval.data.rates import Column, rate_pairs
 from ctxval.errors import InputError
 from ctxval.studies.fitting import FitReport, fit
 from ctxval.studies.fitting.fit import FittedModel
@@ -134,6 +135,10 @@ def survey(
     clock = mapping.clock if mapping is not None else Clock(time) if time else _clock(first, dt, guesses)
     used = _time_of(first, clock)
     evidence = [_evidence(logs[:20], path, clock) for path in first.fields() if path != used]
+    reasons = {each.remark if isinstance(each, FieldSummary) else "" for each in evidence}
+    if len(reasons) == 1 and "" not in reasons:  # there are no times, for example: that error is the answer
+        for log in logs[:20]:
+            log.signals([evidence[0].path], clock)
     summaries = [_summary(each) if isinstance(each, Evidence) else each for each in evidence]
     if mapping is None:
         moving = [each for each in evidence if isinstance(each, Evidence) and _summary(each).moves]
@@ -142,10 +147,8 @@ def survey(
         chosen = mapping
     chosen = chosen if dt is None else replace(chosen, dt=dt)
     recordings = recordings_of(logs, chosen, names)
-    if mapping is None and (turned := _turning(chosen, recordings)):
-        guesses.append(f"{enumerated(turned, 6)} jumps by 2 pi, so it is an angle that is continued over turns")
-        chosen = replace(chosen, states={**chosen.states, **turned})
-        recordings = recordings_of(logs, chosen, names)
+    if mapping is None and (corrected := _corrected(chosen, recordings, guesses)) is not chosen:
+        chosen, recordings = corrected, recordings_of(logs, corrected, names)
     if not any(np.ptp(run.trajectory.states, axis=0).any() for run in recordings.runs):
         raise InputError(
             f"no state ever changes in the logs ({enumerated(recordings.states, 6)}), so nothing is learned."
@@ -184,8 +187,13 @@ def _evidence(logs: Sequence[Log], path: str, clock: Clock) -> Evidence | FieldS
     try:
         signals = [log.signals([path], clock)[path] for log in logs]
     except InputError as error:
-        return FieldSummary(path, "", 0, 0.0, np.nan, np.nan, "", str(error))
+        return FieldSummary(path, "", 0, 0.0, np.nan, np.nan, "", _bare(error, logs[0]))
     return Evidence(path, signals[0].unit, signals)
+
+
+def _bare(error: InputError, log: Log) -> str:
+    """Return the reason why a field of a log cannot be read, without the file and the full stop."""
+    return str(error).removeprefix(log.source).lstrip(",: ").removesuffix(".")
 
 
 def _summary(field: Evidence) -> FieldSummary:
@@ -230,7 +238,7 @@ def _guessed(log: Log, fields: Sequence[FieldSummary], moving: Sequence[Evidence
     if not states:
         raise InputError(
             f"{log.source} has no field that looks like a state; name the states and inputs with --state and --input. "
-            f"Its fields are {enumerated((each.path for each in fields), 24)}."
+            f"Its fields are {_with_reasons(fields, 24)}."
         )
     # Short names: the last part of each path, or the whole path if that is not unique.
     plain = {path: named_unit(path)[0] for path in states + inputs}
@@ -238,20 +246,25 @@ def _guessed(log: Log, fields: Sequence[FieldSummary], moving: Sequence[Evidence
     names = {path: name if [*last.values()].count(name) == 1 else plain[path] for path, name in last.items()}
     taken = f"states: {enumerated(states, 12)}; inputs: {enumerated(inputs, 12) or 'none'}"
     guesses.append(f"the records, units and names of the fields tell what they are taken as; {taken}")
-    if unused := [each.path for each in fields if each.path not in (*states, *inputs)]:
-        guesses.append(f"not used: {enumerated(unused, 12)}")
+    if unused := [each for each in fields if each.path not in (*states, *inputs)]:
+        guesses.append(f"not used: {_with_reasons(unused, 12)}")
     of_states, known = {names[path]: Field(path) for path in states}, {each.path: each for each in moving}
     orders = {path: Column(path, known[path].unit).order for path in states}
     bare = [path for path in states if known[path].values.shape[1] == 1 and not known[path].process]
     if bare and not {1, 2} & {*orders.values()}:
         of_states |= {f"{names[path]} rate": Field(derivative_of=names[path]) for path in bare}
-        guesses.append("no rate is recorded, so the derivatives of the states are states too")
     for path in states:
         if 0 < (share := known[path].repeated) > 0.5:
             guesses.append(
                 f"{path} repeats its value in {100 * share:.0f} % of the records: it is rounded or held there"
             )
     return LogMapping(of_states, {names[path]: Field(path) for path in inputs}, dt=log.period)
+
+
+def _with_reasons(fields: Sequence[FieldSummary], most: int) -> str:
+    """Return the names of fields, each with the remark that tells why it is not used."""
+    unknown = "its name, unit and records show neither a state nor an input"
+    return enumerated((f"{each.path} ({each.remark or unknown})" for each in fields), most)
 
 
 def _clock(log: Log, dt: float | None, guesses: list[str]) -> Clock:
@@ -263,6 +276,26 @@ def _clock(log: Log, dt: float | None, guesses: list[str]) -> Clock:
         return Clock(period=dt or log.period)
     guesses.append(f"the times are those of {inside[0]}")
     return Clock(inside[0])
+
+
+def _corrected(mapping: LogMapping, recordings: Recordings, guesses: list[str]) -> LogMapping:
+    """Return a guessed mapping as the records show it: angles over turns, and no derivatives if a rate is recorded."""
+    states = {**mapping.states, **(turned := _turning(mapping, recordings))}
+    if turned:
+        guesses.append(f"{enumerated(turned, 6)} jumps by 2 pi, so it is an angle that is continued over turns")
+    recorded = [name for name, field in mapping.states.items() if not field.derivative_of]
+    if len(recorded) < len(mapping.states):
+        places = [k for k, name in enumerate(recordings.states) if name in recorded]
+        columns = [Column(list(recordings.states)[k]) for k in places]
+        pasts = [run.trajectory for run in recordings.runs]
+        runs = [Trajectory(past.times, past.states[:, places], past.inputs) for past in pasts]
+        columns += [Column(name, of_input=True) for name in recordings.inputs]
+        if pairs := rate_pairs(runs, columns, recordings.dt):
+            states = {name: field for name, field in states.items() if not field.derivative_of}
+            guesses.append(f"{pairs[0].rate.name} changes as the rate of {pairs[0].state.name} does")
+        else:
+            guesses.append("no rate is recorded, so the derivatives of the states are states too")
+    return mapping if states == mapping.states else replace(mapping, states=states)
 
 
 def _turning(mapping: LogMapping, recordings: Recordings) -> dict[str, Field]:

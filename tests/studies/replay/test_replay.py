@@ -234,7 +234,7 @@ def test_a_single_recording_is_judged_in_five_parts() -> None:
     report = replay(WITHOUT_FRICTION, recorded(RUNS[:1]))
     assert report.errors[1].lowest < report.errors[1].highest
     assert report.residuals[1].explained > 0.99
-    assert any("only one recording" in text for text in report.insights)
+    assert any("only one recording is compared" in text for text in report.insights)
 
 
 def test_a_model_that_diverges_is_said_to_diverge() -> None:

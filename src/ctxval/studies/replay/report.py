@@ -267,7 +267,7 @@ def _insights(report: ReplayReport, used: int) -> Iterator[str]:
     if diverged.diverged > 0:
         yield f"{100 * diverged.diverged:.2g} % of the predictions of {diverged.steps} steps diverge"
     if used == 1:
-        yield "there is only one recording, so the spread is that over five parts of it"
+        yield "only one recording is compared, so the spread is that over five parts of it"
     if any(fault.explains for fault in report.faults):
         return
     # Causes of an error that is small, as a share of the change, are not named.
