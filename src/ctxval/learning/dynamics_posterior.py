@@ -222,7 +222,7 @@ class DynamicsPosterior(ShortRepr):
         Z = bounded(data.standardised(states[:, at], inputs[:, at]))
         variance = most.whitened(Z.reshape(-1, Z.shape[-1]))[1].reshape(Z.shape[:2]).mean(axis=1)
         sizes = (data.sizes / data.steps)[data.learned] ** 2 * most.squares / len(most.centres)
-        return np.asarray(np.sqrt(variance * sizes.mean()))
+        return np.asarray(np.sqrt(variance * (sizes.mean() if len(sizes) else 0.0)))
 
     @property
     def with_most_friction(self) -> Model:
