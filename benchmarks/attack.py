@@ -306,7 +306,9 @@ def inflict(name: str, number: int, seed: int, base: Path, keep: Path | None = N
         case = case_of(name, number, seed, folder, base)
         if keep is not None:
             shutil.copytree(folder, keep, symlinks=True)
-        outcome = _apart(case, folder) if apart and case.client is None else carry_out(case, folder)
+        # No shell can pass a NUL character.
+        alone = apart and case.client is None and not any("\0" in argument for argument in case.arguments)
+        outcome = _apart(case, folder) if alone else carry_out(case, folder)
         return replace(outcome, said=f"{arguments.shown(case.arguments)}\n{outcome.said}")
 
 
