@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import contextlib
 import shutil
+import sqlite3
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,12 +18,25 @@ from ctxval._util.describe import describe
 from ctxval.certificates import CertificateOptions, Posterior
 from ctxval.cli import app
 from ctxval.cli.config.settings import read_settings
-from ctxval.errors import DistanceError, InputError, StoreMismatchError
+from ctxval.errors import DistanceError, InputError, StoreError, StoreMismatchError
 from ctxval.gp.kernels import Matern
 from ctxval.testing import FaultyRig
 from rig_thorough import more
 
 SEARCH = searches.GPUCB
+
+
+@pytest.mark.parametrize("validation", ["[]", "{}", "null"])
+@pytest.mark.parametrize("options", [{}, {"remeasure": True, "accept_change": "another scale"}])
+def test_a_store_that_describes_no_validation_is_damaged(
+    validation: str, options: dict[str, Any], tmp_path: Path
+) -> None:
+    path = tmp_path / "a.sqlite"
+    Campaign(make_validation(), search=searches.Random(), store=path).run(1)
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        database.execute("UPDATE experiment SET value = ? WHERE key = 'validation'", (validation,))
+    with pytest.raises(StoreError):
+        Campaign(make_validation(), search=searches.Random(), store=path, **options)
 
 
 class Scaled:

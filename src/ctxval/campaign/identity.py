@@ -17,7 +17,7 @@ from ctxval.core.plan import least_distance
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import AT_LEAST, REDEFINED, TOLD_ALONE, Change, Trial, Trials
 from ctxval.core.validation import Validation
-from ctxval.errors import CtxvalError, DistanceError, InputError, StoreMismatchError
+from ctxval.errors import CtxvalError, DistanceError, InputError, StoreError, StoreMismatchError
 from ctxval.searches import DEFAULT, REGISTRY, Repeated, Search, by_name
 
 _QUESTION = ("name", "seed", "search", "validation.space")
@@ -85,6 +85,8 @@ def identify(
     store.describe_first(description)
     with store.snapshot():
         stored, trials = store.description(), store.trials()
+    if not isinstance(stored.get("validation"), dict) or "distance" not in stored["validation"]:
+        raise StoreError(f"{store.name} is damaged: it does not describe its validation; use another store.")
     differing = list(differences(stored, description))
     # The trials to recompute: the first, the worst and the last that has ended.
     ended = [trial for trial in trials if trial.executed or trial.state == "open"]
