@@ -203,7 +203,8 @@ class CampaignDynamics:
         best, further = Trials(trials).largest, dict[str, Any]()
         bound = bound_of(evidence, best, confidence)
         further["executed"] = self._explained(learned, trials)
-        further["influential"] = None if learned.influential is None else tuple(learned.influential.tolist())
+        if (influential := learned.influential) is not None:
+            further["influential"] = tuple(influential.tolist())
         further |= {"drift": learned.drift, "uneven": learned.uneven_friction}
         if failed(evidence, bound) is not None:
             further["suspect"] = learned.study.suspected_parameter(learned)

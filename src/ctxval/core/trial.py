@@ -82,7 +82,8 @@ class Trial:
     def ended_alone(self) -> float | None:
         """The seconds after which S fell or became unstable, if M did not; else None."""
         ended = (self.note or {}).get(ENDED)
-        return float(ended["system"]) if self.state == "failed" and isinstance(ended, dict) else None
+        seconds = ended.get("system") if isinstance(ended, dict) else None  # the note of a store
+        return float(seconds) if self.state == "failed" and isinstance(seconds, int | float) else None
 
     def __repr__(self) -> str:
         ended = {"distance": self.distance, "seconds": self.seconds, "attempts": self.attempts}

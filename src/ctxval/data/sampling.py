@@ -195,9 +195,8 @@ def _intersection(first: list[Interval], second: list[Interval]) -> list[Interva
 def _part(
     source: str, channels: Sequence[Channel], start: float, end: float, dt: float
 ) -> tuple[float, Trajectory] | None:
-    samples = channels[
-        0
-    ].recorded  # steps begin at samples of the first state, if its input is delayed by a part of one
+    # Steps begin at samples of the first state, if its input is delayed by a part of one.
+    samples = channels[0].recorded
     later = samples[np.searchsorted(samples, start - _SLACK * dt) :][:1]
     if len(later) and 0 < later[0] - start < channels[0].period:
         start = float(later[0])

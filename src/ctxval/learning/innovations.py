@@ -98,7 +98,7 @@ class InnovationsFit(ABC):
     def runs(self) -> RunEffects:
         """What the innovations of each execution have in common."""
         pairs = self.scaled.Z[:, : self.scaled.states + self.scaled.inputs]
-        return run_effects(pairs, self.innovations, self.live, self.executions, self._hats())
+        return run_effects(pairs, self.innovations, self.live, self.executions, self.hats)
 
     def influences(self, tasks: Sequence[Sequence[int]]) -> Array | None:
         """Return how far the residual along the executions of each task depends on them, in deviations of the noise.
@@ -107,7 +107,9 @@ class InnovationsFit(ABC):
         """
         return None
 
-    def _hats(self) -> list[tuple[Array, Array]] | None:
+    @property
+    def hats(self) -> list[tuple[Array, Array]] | None:
+        """The hat matrix of each learned state in two factors; see :func:`run_effects`. None in a filter."""
         return None
 
     @property
@@ -134,7 +136,9 @@ class LaggedFit(InnovationsFit):
 
     rows: Array  # weights of the transitions, (N, 1)
 
-    def _hats(self) -> list[tuple[Array, Array]]:
+    @functools.cached_property
+    def hats(self) -> list[tuple[Array, Array]]:
+        """The hat matrix of each learned state in two factors; see :func:`run_effects`."""
         phi = self.features(self.scaled.Z)
         spectrum = _Spectrum.of(phi, self.scaled, self.live, self.rows)
         Phi = phi * self.rows
@@ -143,7 +147,7 @@ class LaggedFit(InnovationsFit):
     def influences(self, tasks: Sequence[Sequence[int]]) -> Array:
         """Return how far the residual along the executions of each task depends on them; see the base class."""
         squares = np.zeros((len(tasks), int(self.live.sum())))
-        for place, (i, (Phi, inverse)) in enumerate(zip(np.flatnonzero(self.live), self._hats(), strict=True)):
+        for place, (i, (Phi, inverse)) in enumerate(zip(np.flatnonzero(self.live), self.hats, strict=True)):
             for row, executions in enumerate(tasks):
                 steps = np.concatenate([self.executions[k] for k in executions])
                 own, e = Phi[steps], self.innovations[steps, i]
