@@ -56,7 +56,7 @@ class Cell:
     n: int
     results: list[tuple[float, dict[str, Any]]]
 
-    def missed(self, level: int) -> int:
+    def search_shortfall(self, level: int) -> int:
         """Return how many bounds are below the truth, by more than rounding."""
         return sum(truth > check["bounds"][level] + 1e-9 * abs(truth) for truth, check in self.results)
 
@@ -107,7 +107,7 @@ def exact_table() -> str:
     for cell in cells([("prior", d) for d in FAMILIES["prior"][1]], "exact"):
         levels = []
         for level, confidence in enumerate(CONFIDENCES):
-            missed = cell.missed(level)
+            missed = cell.search_shortfall(level)
             low, high = interval(missed, len(cell.results))
             levels.append(f"{coverage(missed, len(cell.results), confidence)}, {low:.1f} to {high:.1f} %")
         rows.append([f"{cell.dimension}-D", str(cell.n), *levels])
@@ -127,7 +127,7 @@ def used_table(names: Iterable[tuple[str, int]]) -> str:
                 cell.family,
                 f"{cell.dimension}-D",
                 str(cell.n),
-                *(coverage(cell.missed(k), len(cell.results), c) for k, c in enumerate(CONFIDENCES)),
+                *(coverage(cell.search_shortfall(k), len(cell.results), c) for k, c in enumerate(CONFIDENCES)),
                 f"{100 * cell.share(lambda _, check: is_doubted(check)):.0f} %",
                 f"{100 * plugged:.0f} %",
                 f"{100 * middle:.2g} % ({100 * low:.2g} to {100 * high:.2g})",
@@ -186,7 +186,7 @@ def draw_coverage() -> None:
         for at, family in enumerate(names):
             found = cells([(family, dimension)] if dimension in FAMILIES[family][1] else [])
             for shade, cell in zip((0.45, 0.7, 1.0), found, strict=False):
-                missed, total = cell.missed(1), len(cell.results)
+                missed, total = cell.search_shortfall(1), len(cell.results)
                 x = at + offset + 0.06 * (shade - 0.7) / 0.3
                 axes.plot([x, x], interval(missed, total), color=colour, alpha=shade, linewidth=1)
                 axes.plot(x, 100 * (1 - missed / total), marker, color=colour, alpha=shade, markersize=5)

@@ -308,7 +308,7 @@ def counting(batched: bool) -> tuple[LoopPlanner, CountingLQR]:
 def final_states(planner: LoopPlanner, points: Array) -> Array:
     found = np.full((len(points), 2), np.nan)
     for one in planner.plan(points, together=4):
-        found[one.rows] = one.promised.final_state
+        found[one.rows] = one.nominal.final_state
     return found
 
 

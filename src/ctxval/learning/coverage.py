@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.texts import parted
-from ctxval.core.coverage import StateInputCoverage, StateInputGap, StatePocket, UntriedCorner
+from ctxval.core.coverage import StateInputCoverage, StateInputGap, UnsampledCorner, UnvisitedRegion
 from ctxval.core.space import TaskSpace, are_coordinates_of_ground
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import Loops, PlannedTasks
@@ -120,7 +120,7 @@ def largest_pocket(
     positions: Sequence[Sequence[int]] = (),
     of_task: Rows | None = None,
     tasks: Array | None = None,
-) -> StatePocket | None:
+) -> UnvisitedRegion | None:
     """Return the largest pocket; None if there are no two states, or nothing was executed.
 
     Coordinates of a position, and two states with one unit that is no rate, are places, and distances in their plane
@@ -163,7 +163,7 @@ def largest_pocket(
             path = cKDTree(visited[of_task == row][:, two] / scale)
             left[row] = (np.minimum(away[few], path.query(some[few][:, two] / scale)[0]) ** 6).sum()
         next_tasks = tuple(map(tuple, tasks[[left.argmin(), of_task[rows[at]]]].tolist()))
-    return StatePocket(
+    return UnvisitedRegion(
         float(away[at]), dict(zip(names, place, strict=True)), dict(zip(names, within, strict=True)), next_tasks
     )
 
@@ -265,7 +265,7 @@ def farthest_value(
     return float(away[chosen]), float(places[chosen])
 
 
-def untried_corner(executed: Array, space: TaskSpace, task: Array) -> UntriedCorner | None:
+def unsampled_corner(executed: Array, space: TaskSpace, task: Array) -> UnsampledCorner | None:
     """Return the corner that is farthest from executed tasks ``(n, d)``; None if no task parameter is a position.
 
     Its task has the parameters of ``task`` ``(d,)``, except that each position moves to its own farthest corner.
@@ -284,4 +284,4 @@ def untried_corner(executed: Array, space: TaskSpace, task: Array) -> UntriedCor
     if not farthest:
         return None
     values = space.from_unit(task)
-    return UntriedCorner({space.labels[j]: float(values[j]) for j in components}, farthest, task)
+    return UnsampledCorner({space.labels[j]: float(values[j]) for j in components}, farthest, task)

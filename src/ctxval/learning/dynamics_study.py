@@ -82,7 +82,7 @@ class DynamicsStudy(ShortRepr):
         #: largest distances of tasks if M errs by so much in each step, of each error and task
         self.under_errors: dict[bytes, dict[bytes, float]] = {}
 
-    def anew(self, quantile: float | None = None) -> DynamicsStudy:
+    def fresh_copy(self, quantile: float | None = None) -> DynamicsStudy:
         """Return a study of the same experiment that has learned nothing yet, with a quantile if it is given."""
         return DynamicsStudy(self.given, self.seed, self.quantile if quantile is None else quantile)
 
