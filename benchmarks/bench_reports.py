@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ctxval import Campaign, cases, searches
-from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.report import context_of_campaign, write_page
 
 EXECUTIONS = {"pendulum": 25, "dubins": 100, "arm": 50}
@@ -35,7 +35,7 @@ def write(name: str, folder: Path) -> tuple[Path, float]:
     """Return the report of a case, and the CPU seconds that it took without the campaign and its verdict."""
     experiment = cases.by_name(name)
     campaign = Campaign(experiment.validation, search=searches.Random(), seed=0, name=name).run(EXECUTIONS[name])
-    verdict = campaign.verdict(experiment.threshold or 1.0, certificate=CertificateOptions(Posterior()))
+    verdict = campaign.verdict(experiment.threshold or 1.0, certificate=CertificateOptions(DistanceBound()))
     started = time.process_time()
     path = write_page(context_of_campaign(campaign, verdict), folder / f"{name}.html")
     return path, time.process_time() - started

@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 from ctxval import cases
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
-from ctxval.certificates import Posterior, Sample, draw_maxima
+from ctxval.certificates import DistanceBound, Sample, draw_maxima
 from ctxval.errors import CertificateError
 from ctxval.gp.hyperposterior import Prior
 from ctxval.paper.reproduce.jobs import Job, Results
@@ -248,7 +248,7 @@ def certified(
         found = draw_maxima(sample, draws=DRAWS, paths=PATHS, seed=seed, prior=prior, stochastic=stochastic)
     except CertificateError as error:
         return {"n": len(values), "refused": str(error)}
-    details = Posterior().certify_drawn(sample, found).details
+    details = DistanceBound().certify_drawn(sample, found).details
     return {
         "n": len(values),
         "best": sample.best,

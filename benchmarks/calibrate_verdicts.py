@@ -20,7 +20,7 @@ from calibration_functions import DEVELOPMENT, REPORTING, generator
 from ctxval import Campaign, Trial, cases
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
-from ctxval.certificates import RESOLUTION, CertificateOptions, Posterior, StoppingRule, covering
+from ctxval.certificates import RESOLUTION, CertificateOptions, DistanceBound, StoppingRule, covering
 from ctxval.certificates.verdict import counterexample
 from ctxval.paper.reproduce.jobs import Job, Results
 from named_searches import search_named
@@ -145,7 +145,7 @@ def _of_system(one: Decision) -> dict[str, Any]:
     experiment = cases.by_name(system.case, one.seed, **dict(system.options))
     threshold, budget = one.share * best_known, BUDGETS[one.dimension]
     campaign = Campaign(experiment.validation, search=search_named(one.search), seed=one.seed)
-    campaign.run(budget, threshold, certificate=CertificateOptions(Posterior()))
+    campaign.run(budget, threshold, certificate=CertificateOptions(DistanceBound()))
     return _summary(
         list(campaign.trials), threshold, decided=StoppingRule(threshold).decide(campaign.trials, 0).decided
     )

@@ -36,7 +36,8 @@ incomplete state, jumps or noise; `validated` is true of it as well at 1.1 d*.
   bound below d*, the lowest at {lowest:.4f} d*.
 - **Models that are rougher than the system** (networks, Gaussian processes of few points): {rough_95} were validated
   falsely at 0.95 d*, and {rough_11} on systems that do not mislead were validated at 1.1 d*. Two of the first
-  campaigns were validated falsely; `sharpness`, `jump`, `missed` and `disagreement` were added for this reason.
+  campaigns were validated falsely; `peak_ratio`, `jump`, `search_shortfall` and `disagreement` were added for this
+  reason.
 - **The paper's cases** ({paper_seeds} seeds, at most {budget_paper} executions; the method was tried on them while
   it was written): {paper_compared}
 

@@ -19,7 +19,7 @@ import numpy as np
 from crane import experiment
 from ctxval import Campaign, Validation, searches
 from ctxval._util.arrays import Array
-from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.core.controller import converged_of
 from ctxval.gp.global_search import search_globally
 
@@ -66,7 +66,7 @@ def study(seed: int) -> dict[str, Any]:
     seconds = time.process_time() - begun
     worst = campaign.worst
     assert worst is not None
-    options = CertificateOptions(Posterior())
+    options = CertificateOptions(DistanceBound())
     return {
         "seed": seed,
         "d_star": largest,

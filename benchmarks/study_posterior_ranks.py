@@ -184,7 +184,7 @@ def ranks(design: str, states: int, seed: int) -> dict[str, Any]:
     planned = planner.plan(tasks[:RANKED])
     loops = random_loops(truth.step, validation, tasks[:RANKED])
     with np.errstate(all="ignore"):
-        d = np.where(loops.finite, validation.distance(planned[0].promised, loops, planned[0].task), np.inf)
+        d = np.where(loops.finite, validation.distance(planned[0].nominal, loops, planned[0].task), np.inf)
     return {
         "transitions": len(transitions),
         "residual": ranked(truth.missed(x, u)[of_state], residuals, rng),

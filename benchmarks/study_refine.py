@@ -21,7 +21,7 @@ import numpy as np
 from ctxval import Campaign, Trajectory, Validation, cases, grid_truth, models, refine, search_truth, searches, systems
 from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
-from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.paper.cases import pendulum
 from ctxval.paper.reproduce.jobs import AUTO, measured_with, provenance
 from ctxval.studies.refinement import Method, ParameterFit, Records
@@ -72,7 +72,7 @@ def run(case: str, seed: int, data: str, method: str | Method) -> dict[str, Any]
     began = time.process_time()
     try:
         # The posterior bound chooses tasks at a tenth of the effort, and d* after is judged by the truth anyway.
-        judged = CertificateOptions(Posterior())
+        judged = CertificateOptions(DistanceBound())
         found = refine(campaign, SHARE * before, BUDGETS[case], method=method, certificate=judged)
     except Exception as error:  # a method that cannot learn from these executions is a result
         return {"before": before, "after": None, "ratio": None, "executions": campaign.executions, "why": str(error)}

@@ -32,9 +32,9 @@ with tempfile.TemporaryDirectory() as folder:
     for trial in sorted(tuesday.completed, key=lambda trial: -trial.distance)[:5]:
         print(f"{trial.number:5d}  {trial.origin:11s}  {trial.parameters['goal']:10.3f}  {trial.distance:8.3f}")
 
-    promised, happened = tuesday.trajectories(worst)
+    nominal, happened = tuesday.trajectories(worst)
     print(f"\nThe worst task, trial {worst.number}: swing to {worst.parameters['goal']:.2f} rad.")
     print("time [s]  model [rad]  system [rad]")
-    for t in range(0, len(promised.times), 25):
-        print(f"{promised.times[t]:8.2f}  {promised.states[t, 0]:11.3f}  {happened.states[t, 0]:12.3f}")
+    for t in range(0, len(nominal.times), 25):
+        print(f"{nominal.times[t]:8.2f}  {nominal.states[t, 0]:11.3f}  {happened.states[t, 0]:12.3f}")
     tuesday.store.close()

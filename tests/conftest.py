@@ -174,8 +174,8 @@ class Predicted:
         checked = tuple(
             CheckedPrediction(k, 0.5, 1.0, 1.2, 1.0, origin="spread", point=task) for k, task in enumerate(tasks)
         )
-        draws, elites = rng.random((2000, self.dimension)), rng.random((3, self.dimension))
-        return DynamicsEvidence(np.linspace(2, 3, 2000), draws, 1.9, elites, 999, 5, 0.0, 0.0, checked, covered)
+        draws, local_maxima = rng.random((2000, self.dimension)), rng.random((3, self.dimension))
+        return DynamicsEvidence(np.linspace(2, 3, 2000), draws, 1.9, local_maxima, 999, 5, 0.0, 0.0, checked, covered)
 
     def tasks(self, count: int, seed: int) -> np.ndarray:
         return np.random.default_rng([seed, 9]).random((count, self.dimension))

@@ -43,7 +43,7 @@ def take_few_draws(replace: Callable[[str, Any], None], *, once: bool = False) -
 def run_few_loops(replace: Callable[[str, Any], None]) -> None:
     """Make searches of the learned dynamics smaller, by a function that replaces an attribute."""
     loops = WorstCaseSettings(
-        pool=48, evaluations=100, elites=6, shared=8, moves=3, rounds=1, relevant=200, peaks=1, nearby=8
+        pool=48, evaluations=100, local_maxima=6, shared=8, moves=3, rounds=1, relevant=200, peaks=1, nearby=8
     )
     draws = PosteriorSettings(hyperparameters=10, learned_from=40, centres=80, pivots=40, families=FAMILIES[:1])
     replace("ctxval.learning.worst_case.WorstCaseSettings.for_dimension", lambda *_: loops)

@@ -19,8 +19,8 @@ from ctxval.certificates import (
     AnytimeAudit,
     Audit,
     CheckedPrediction,
+    DistanceBound,
     DynamicsEvidence,
-    Posterior,
     Region,
     Sample,
     StateInputCoverage,
@@ -115,7 +115,7 @@ def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
         certify_dynamics(sample, evidence()),
         Region().certify(replace(sample, threshold=3.0)),
         WholeSuite().certify(replace(sample, suite=points)),
-        Posterior().certify_drawn(sample, draw_maxima(sample, draws=4, paths=2), 0.5),
+        DistanceBound().certify_drawn(sample, draw_maxima(sample, draws=4, paths=2), 0.5),
     ]
     used = set().union(*(keys(certificate.to_json()) for certificate in certificates))
     used |= keys({PREDICTION: ExecutionPrediction(1, (0.5,), 0.1, (1,), ((0.0,),), ((0.1,),), 0.0).to_json()})

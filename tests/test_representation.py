@@ -211,7 +211,7 @@ RECORDED = Transitions(DATA.x, DATA.u, nonlinear(DATA.x, DATA.u))
 CHECKED = certificates.CheckedPrediction(3, 0.5, 0.52, 0.53, 0.5)
 GAP = certificates.StateInputGap(0.1, ("u[0]",), {"x[0]": 1.0, "u[0]": 3.0})
 COVERED = certificates.StateInputCoverage(GAP, GAP, None, {"x[0]": 0.1, "u[0]": 0.2}, np.zeros(2), 1024)
-BY_POSTERIOR = certificates.CertificateOptions(certificates.Posterior())
+BY_POSTERIOR = certificates.CertificateOptions(certificates.DistanceBound())
 
 LOG = data.MemoryTable(
     "run.csv", {"t": 0.1 * np.arange(41), "x": np.sin(np.arange(82)).reshape(41, 2), "u": np.ones(40)}
@@ -368,23 +368,23 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.Dynamics": certificates.Dynamics,
     "certificates.DynamicsEvidence": evidence,
     "certificates.Neighbour": lambda: certificates.Neighbour(Path("other.sqlite")),
-    "certificates.Posterior": certificates.Posterior,
+    "certificates.DistanceBound": certificates.DistanceBound,
     "certificates.Provenance": lambda: certificates.Provenance(remarks=("fuse replaced",)),
     "certificates.SamplingDiscarding": lambda: certificates.SamplingDiscarding(2),
     "certificates.Scenario": certificates.Scenario,
     "certificates.StateInputCoverage": lambda: COVERED,
     "certificates.StateInputGap": lambda: GAP,
-    "certificates.UntriedParameter": lambda: certificates.UntriedParameter("load", 0.4, np.zeros(2)),
+    "certificates.UnsampledParameter": lambda: certificates.UnsampledParameter("load", 0.4, np.zeros(2)),
     "certificates.StoppingDecision": lambda: certificates.StoppingDecision(next_point=np.zeros(3)),
     "certificates.StoppingRule": lambda: certificates.StoppingRule(0.5),
     "certificates.Diagnosis": diagnosis,
     "certificates.Forecast": lambda: certificates.Forecast(12, 0.75, 0.25),
-    "certificates.MadeGood": lambda: certificates.MadeGood(3, 7, "fuse replaced"),
+    "certificates.RecoveredFailure": lambda: certificates.RecoveredFailure(3, 7, "fuse replaced"),
     "certificates.Maxima": lambda: certificates.draw_maxima(sample(), draws=12, paths=4),
     "certificates.Region": certificates.Region,
     "certificates.Sample": sample,
     "certificates.Verdict": lambda: certificates.judge(
-        campaign().trials, 0.01, certificates.CertificateOptions(certificates.Posterior())
+        campaign().trials, 0.01, certificates.CertificateOptions(certificates.DistanceBound())
     ),
     "data.Break": lambda: data.Break("run.csv", 0.5, 0.2, "angle", "has no value in row 7"),
     "data.Channel": lambda: data.Channel("angle", "rad", False, np.arange(9.0), np.arange(9.0)),
@@ -640,7 +640,7 @@ ATTACKS: dict[str, Callable[[], object]] = {
     "many parameters": lambda: TaskSpace(**{f"parameter_{i}": (0, 1, "rad") for i in range(10_000)}),
     "trajectory": lambda: Trajectory(TASK.times, np.zeros((26, 2)), np.zeros((25, 1)), HOSTILE),
     "truth": lambda: Truth(1.0, SPACE.parameters([1, 2, 3, 4]), HOSTILE),
-    "made good": lambda: certificates.MadeGood(1, 2, HOSTILE),
+    "made good": lambda: certificates.RecoveredFailure(1, 2, HOSTILE),
     "diagnosis": lambda: certificates.Diagnosis(0.0, 1, 1.0, 1.0, HOSTILE),
     "manual": lambda: systems.Manual(states={"x": HOSTILE}, inputs={}, dt=1.0),
     "command": lambda: systems.Subprocess([sys.executable, HOSTILE], timeout=1.0),

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 from crane import experiment
 from ctxval import Campaign, searches
-from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.core.controller import converged_of
 from study_crane import truth, typed
 
@@ -44,7 +44,7 @@ def test_verdicts_on_the_crane_are_true_and_its_worst_task_can_be_typed_again() 
     validation = experiment(0).validation
     largest = truth(validation, 600)
     campaign = Campaign(validation, search=searches.Auto(50), seed=0).run(8, explore=True)
-    options = CertificateOptions(Posterior())
+    options = CertificateOptions(DistanceBound())
     assert campaign.verdict(0.9 * largest, certificate=options).answer == "falsified"
     above = campaign.verdict(1.1 * largest, certificate=options)
     assert above.answer != "falsified"

@@ -13,7 +13,7 @@ from scipy.stats import kstest
 from conftest import interrupt_at_once, make_validation
 from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, searches, systems
 from ctxval._util.arrays import Array
-from ctxval.certificates import RESOLUTION, CertificateOptions, Posterior, farthest_task
+from ctxval.certificates import RESOLUTION, CertificateOptions, DistanceBound, farthest_task
 from ctxval.core.trial import Trial
 from ctxval.errors import (
     CampaignError,
@@ -28,7 +28,7 @@ from ctxval.errors import (
 )
 from ctxval.testing import FaultyRig
 
-BY_DISTANCE = CertificateOptions(Posterior())
+BY_DISTANCE = CertificateOptions(DistanceBound())
 
 
 class OneCorner(searches.SequentialSearch):

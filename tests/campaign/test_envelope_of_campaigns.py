@@ -120,7 +120,7 @@ def test_bad_input_is_refused() -> None:
         campaign.run(5, envelope=True)
     with pytest.raises(InputError, match="an envelope needs a threshold, and a campaign that does not explore"):
         campaign.run(5, TAU, explore=True, envelope=True)
-    by = certificates.CertificateOptions(certificates.Posterior())
+    by = certificates.CertificateOptions(certificates.DistanceBound())
     with pytest.raises(InputError, match="needs one of the certificates auto and dynamics, got 'posterior'"):
         campaign.envelope(TAU, certificate=by)
     assert campaign.executions == 0

@@ -15,7 +15,7 @@ from conftest import make_validation
 from ctxval import Campaign, Store, TaskSpace, Validation, distances, searches
 from ctxval._util.arrays import Array
 from ctxval._util.describe import describe
-from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.cli import app
 from ctxval.cli.config.settings import read_settings
 from ctxval.errors import DistanceError, InputError, StoreError, StoreMismatchError
@@ -238,7 +238,7 @@ def test_a_failure_cannot_be_dropped(store: Path) -> None:
     failed = made.tell(made.ask(), failed="it slipped")
     with pytest.raises(InputError, match=f"trial {failed.number} is failed"):
         made.tell(failed.number, distance=0.1)
-    by = CertificateOptions(Posterior(resolution=1.0))
+    by = CertificateOptions(DistanceBound(resolution=1.0))
     assert made.verdict(1e3, certificate=by).answer == "undecided"
     made.tell(made.ask(failed.parameters), distance=0.1)  # it succeeds for no stated reason
     verdict = made.verdict(1e3, certificate=by)
@@ -445,7 +445,7 @@ def test_counters_of_a_system_do_not_go_into_the_store_with_another_distance(tmp
 
 @pytest.mark.slow
 def test_a_task_that_was_told_in_another_distance_counts_again_once_it_is_executed(store: Path) -> None:
-    told, by = campaign(store), CertificateOptions(Posterior(resolution=1.0))
+    told, by = campaign(store), CertificateOptions(DistanceBound(resolution=1.0))
     told.tell(told.ask({"goal": 1.0}), distance=0.25)
     told.remeasure(Scaled(scale=2.0))
     assert "Trial 7 was executed, but the distance could not be measured" in told.verdict(1e6, certificate=by).reason

@@ -28,24 +28,24 @@ from ctxval import (
 )
 from ctxval.campaign.dynamics import NEAR, PREDICTION
 from ctxval.campaign.interval_search import IntervalSearch
-from ctxval.campaign.next_task import NewTasks, next_task
+from ctxval.campaign.next_task import CandidateFilter, next_task
 from ctxval.certificates import (
     AnytimeAudit,
     Audit,
     CertificateOptions,
     CheckedPrediction,
+    DistanceBound,
     Dynamics,
     DynamicsEvidence,
-    Posterior,
     StateInputCoverage,
     StateInputGap,
-    UntriedCorner,
-    UntriedParameter,
+    UnsampledCorner,
+    UnsampledParameter,
 )
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.dynamics_diagnostics import POCKET
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, hypercube_in, share_missed
-from ctxval.core.coverage import StatePocket
+from ctxval.core.coverage import UnvisitedRegion
 from ctxval.errors import InputError
 from ctxval.learning import dynamics_study
 from ctxval.learning.dynamics_posterior import condition
@@ -106,14 +106,14 @@ def test_places_of_a_position_are_entered_before_a_validation() -> None:
     verdict = campaign.verdict(1.0, certificate=options)
     assert verdict.answer == "validated"
     assert verdict.certificate is not None
-    pocket = verdict.certificate.details["pocket"]
+    pocket = verdict.certificate.details["unvisited_region"]
     assert list(pocket["place"]) == ["x[0]", "x[1]"]
     assert pocket["size"] <= POCKET
     # The runs of the last tasks led into places, as nothing else was missing.
     less = campaign.recorder.dynamics.learned(campaign.trials[:-1])
     assert less is not None
-    assert less.pocket is not None
-    assert less.pocket.size > POCKET
+    assert less.unvisited_region is not None
+    assert less.unvisited_region.size > POCKET
 
 
 @pytest.mark.slow
@@ -321,8 +321,8 @@ def test_a_hypercube_that_was_begun_is_completed_before_tests_are_independent_dr
 @pytest.mark.thorough
 def test_the_posterior_bound_predicts_nothing() -> None:
     campaign = Campaign(make_validation(), seed=1)
-    campaign.run(20, 1e3, certificate=CertificateOptions(Posterior()))
-    assert campaign.verdict(1e3, certificate=CertificateOptions(Posterior())).answer == "validated"
+    campaign.run(20, 1e3, certificate=CertificateOptions(DistanceBound()))
+    assert campaign.verdict(1e3, certificate=CertificateOptions(DistanceBound())).answer == "validated"
     assert not any(PREDICTION in (trial.note or {}) for trial in campaign.trials)
 
 
@@ -347,7 +347,7 @@ def evidence(upper: float = 1.0, highest: float = 0.9) -> DynamicsEvidence:
 def test_what_is_executed_next_depends_on_what_stands_in_the_way() -> None:
     known = np.array([[0.9, 0.9]])
     contested = evidence()
-    at_bound, farthest, largest = contested.points[38], contested.coverage.task, contested.elites[0]
+    at_bound, farthest, largest = contested.points[38], contested.coverage.task, contested.local_maxima[0]
     assert asked(contested, known, 0.5) == largest.tolist()
     assert asked(contested, known, 0.95) == at_bound.tolist()
     assert asked(contested, known, 2.0) == farthest.tolist()
@@ -358,12 +358,12 @@ def test_what_is_executed_next_depends_on_what_stands_in_the_way() -> None:
     tested = replace(covered, predictions=held)
     assert asked(tested, known, 2.0, best=0.9) == at_bound.tolist()
     assert asked(tested, np.tile(known, (2, 1)), 2.0, best=0.9) == farthest.tolist()
-    load = replace(covered, untried=UntriedParameter("load", 0.5, np.array([0.3, 0.4])))
+    load = replace(covered, unsampled_parameter=UnsampledParameter("load", 0.5, np.array([0.3, 0.4])))
     assert asked(load, known, 2.0, best=0.2) == [0.3, 0.4]
-    corner = replace(covered, corner=UntriedCorner({"x": 0.0, "y": 1.0}, 0.5, np.array([0.0, 1.0])))
+    corner = replace(covered, unsampled_corner=UnsampledCorner({"x": 0.0, "y": 1.0}, 0.5, np.array([0.0, 1.0])))
     assert asked(corner, known, 2.0, best=0.2) == [0.0, 1.0]
     tasks = ((0.2, 0.6), (0.1, 0.7))
-    place = replace(covered, pocket=StatePocket(0.3, {"x": 1.0, "y": 1.0}, {"x": 0.3, "y": 0.3}, tasks))
+    place = replace(covered, unvisited_region=UnvisitedRegion(0.3, {"x": 1.0, "y": 1.0}, {"x": 0.3, "y": 0.3}, tasks))
     assert asked(place, known, 2.0, best=0.2) == [0.2, 0.6]
     assert asked(place, np.array([[0.2, 0.6]]), 2.0, best=0.2) == [0.1, 0.7]
     # Every third execution explores, and no task is executed twice.
@@ -381,13 +381,13 @@ def test_next_to_an_executed_task_one_more_may_lead_elsewhere() -> None:
 
 def test_no_task_is_executed_a_second_time() -> None:
     contested = evidence()
-    known = np.concatenate([contested.points, contested.elites, contested.coverage.task[None]])
+    known = np.concatenate([contested.points, contested.local_maxima, contested.coverage.task[None]])
     for _ in range(5):
         fresh = np.array(asked(contested, known, 2.0))
         assert np.abs(known - fresh).max(axis=1).min() > NEAR
         known = np.concatenate([known, fresh[None]])
     everywhere = np.stack(np.meshgrid(*[np.linspace(0, 1, 60)] * 2), axis=-1).reshape(-1, 2)
-    assert next_task(contested, everywhere, 0.2, 2.0, 0.95, NewTasks()) is None
+    assert next_task(contested, everywhere, 0.2, 2.0, 0.95, CandidateFilter()) is None
 
 
 def test_friction_at_rest_is_tried_at_the_least_that_nears_the_limit() -> None:
@@ -411,7 +411,7 @@ def test_a_task_is_new_by_the_parameters_that_change_predictions() -> None:
         return np.array([task[0], 0.123])
 
     def chosen(known: np.ndarray, spread: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> list[float]:
-        task = next_task(contested, known, 0.2, 2.0, 0.95, NewTasks(spread=spread, seen=seen))
+        task = next_task(contested, known, 0.2, 2.0, 0.95, CandidateFilter(spread=spread, seen=seen))
         assert task is not None
         return list(task.tolist())
 
@@ -443,7 +443,7 @@ def test_beside_a_failed_test_the_task_is_looked_for_that_it_would_make_worse() 
 
 
 def asked(found: DynamicsEvidence, known: np.ndarray, threshold: float, best: float = 0.2) -> list[float]:
-    point = next_task(found, known, best, threshold, 0.95, NewTasks())
+    point = next_task(found, known, best, threshold, 0.95, CandidateFilter())
     assert point is not None
     return list(point.tolist())
 
@@ -495,7 +495,7 @@ def test_before_a_bound_is_possible_nothing_but_the_mean_is_searched() -> None:
     assert after is not None
     assert len(before.maxima) == 1
     assert before.upper(0.95) == before.highest
-    np.testing.assert_array_equal(before.points, before.elites[:1])
+    np.testing.assert_array_equal(before.points, before.local_maxima[:1])
     assert len(after.maxima) > 1
 
 
@@ -512,9 +512,9 @@ def test_a_decided_campaign_that_is_run_again_computes_nothing(
 
 
 def test_evidence_is_the_same_after_it_was_kept() -> None:
-    load = UntriedParameter("load", 0.5, np.array([0.3, 0.4]))
+    load = UnsampledParameter("load", 0.5, np.array([0.3, 0.4]))
     checked = (CheckedPrediction(3, np.nan, np.inf, np.inf, 0.9),)
-    found = replace(evidence(), untried=load, predictions=checked, maxima=np.array([0.1, np.inf] * 20))
+    found = replace(evidence(), unsampled_parameter=load, predictions=checked, maxima=np.array([0.1, np.inf] * 20))
     kept = DynamicsEvidence.from_json(json.loads(json.dumps(found.to_json())))
     assert kept is not None
     assert json.dumps(kept.to_json()) == json.dumps(found.to_json())

@@ -12,7 +12,7 @@ import pytest
 from conftest import make_validation
 from ctxval import Campaign, Validation, grid_truth, search_truth, searches
 from ctxval._util.progress import Progress, listening
-from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.errors import StoreAccessError
 from ctxval.gp.ascent import usual_effort
 
@@ -79,7 +79,7 @@ def test_certifying_reports_what_takes_long() -> None:
     campaign = random_campaign().run(5)
     stages = last_of(reports_of(lambda: campaign.verdict(9.0)))
     assert {"certifying", "searching the learned dynamics"} <= set(stages)
-    posterior = CertificateOptions(Posterior())
+    posterior = CertificateOptions(DistanceBound())
     assert "drawing the largest distance" in last_of(reports_of(lambda: campaign.verdict(9.0, certificate=posterior)))
     loops = stages["searching the learned dynamics"]
     assert loops.done > 500

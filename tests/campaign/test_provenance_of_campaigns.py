@@ -13,13 +13,13 @@ from typer.testing import CliRunner
 from conftest import make_validation
 from ctxval import Campaign, Store, Verdict, searches
 from ctxval.campaign.storage.other_stores import provenance_of_store
-from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.cli import app
 from ctxval.errors import ForeignStoreError
 from ctxval.report.context import context_of_campaign
 from rig_thorough import more
 
-BY = CertificateOptions(Posterior(resolution=1.0))
+BY = CertificateOptions(DistanceBound(resolution=1.0))
 LOOKED = "the threshold was stated after"
 
 

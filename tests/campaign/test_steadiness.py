@@ -12,7 +12,7 @@ from conftest import make_validation
 from ctxval import Campaign, Task, Validation, controllers, searches
 from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
-from ctxval.campaign.proposals import Steadiness
+from ctxval.campaign.proposals import DesignContinuity
 from ctxval.core.controller import AffineFeedback, Controller
 from ctxval.core.model import Model
 from ctxval.core.trial import UNSTEADY
@@ -59,7 +59,7 @@ def test_a_task_is_steady_if_its_neighbours_are_like_it(predicted: bool) -> None
     def expected(points: Array) -> Array:
         return validation.distances(space.from_unit(points))
 
-    steady = Steadiness(planner, expected if predicted else None)
+    steady = DesignContinuity(planner, expected if predicted else None)
     points = np.random.default_rng(0).random((20, 1))
     for point in points:
         rounded = space.rounded(point)
@@ -67,7 +67,7 @@ def test_a_task_is_steady_if_its_neighbours_are_like_it(predicted: bool) -> None
         lost = {is_accident(validation, float(goal)) for (goal,) in space.from_unit(near)}
         assert steady(point) == (len(lost) == 1)
     assert 0 < steady.rejected < 20
-    smooth = Steadiness(LoopPlanner(make_validation()))
+    smooth = DesignContinuity(LoopPlanner(make_validation()))
     assert all(map(smooth, points))
     assert not smooth.rejected
 
@@ -75,7 +75,7 @@ def test_a_task_is_steady_if_its_neighbours_are_like_it(predicted: bool) -> None
 @pytest.mark.parametrize("search", [searches.GPUCB(), searches.CMAES(), searches.Auto("fast")])
 def test_the_tasks_of_a_search_are_steady(search: searches.Search) -> None:
     campaign = Campaign(accidental(), search=search, seed=2).run(6, explore=True)
-    steady = Steadiness(LoopPlanner(campaign.validation))
+    steady = DesignContinuity(LoopPlanner(campaign.validation))
     rejected = [(trial.note or {}).get(UNSTEADY, 0) for trial in campaign.trials]
     assert sum(rejected) > 0 or isinstance(search, searches.Auto)  # which executes bounds here
     assert all(map(steady, (trial.unit_point for trial in campaign.trials)))
@@ -147,7 +147,7 @@ class Broken:
 def test_a_design_that_fails_is_reported_when_the_task_is_planned(error: BaseException) -> None:
     whole = make_validation()
     planner = LoopPlanner(Validation(**{**vars(whole), "synthesizer": Broken(error)}))
-    assert Steadiness(planner)(np.array([0.3]))
+    assert DesignContinuity(planner)(np.array([0.3]))
 
 
 def test_the_note_of_a_search_has_no_keys_of_the_campaign() -> None:
@@ -207,7 +207,7 @@ def switching(t: int, x: Array, task: Task) -> Array:
 )
 def test_every_synthesizer_is_tested_in_the_same_way(synthesizer: Any, jumps: bool) -> None:
     validation = Validation(**{**vars(make_validation(horizon=12)), "synthesizer": synthesizer})
-    steady = Steadiness(LoopPlanner(validation))
+    steady = DesignContinuity(LoopPlanner(validation))
     found = [steady(point) for point in np.random.default_rng(1).random((12, 1))]
     assert (0 < steady.rejected < 12) if jumps else all(found)
 

@@ -11,7 +11,7 @@ import pytest
 
 from ctxval import Campaign, Task, TaskSuite, Trajectory, Validation, systems
 from ctxval.campaign import plot
-from ctxval.certificates import Audit, CertificateOptions, Posterior, WholeSuite
+from ctxval.certificates import Audit, CertificateOptions, DistanceBound, WholeSuite
 from ctxval.core.controller import Controller
 from ctxval.errors import CertificateError, InputError
 from ctxval.searches import CMAES, GPUCB, BayesianOptimisation, Random
@@ -127,7 +127,7 @@ def test_what_needs_independent_draws_is_refused() -> None:
     for draw in (lambda: campaign.ask(draw=True), lambda: campaign.audit(3)):
         with pytest.raises(CertificateError, match="no independent draws"):
             draw()
-    for kind in (Posterior(), Audit()):
+    for kind in (DistanceBound(), Audit()):
         with pytest.raises((CertificateError, InputError), match="suite"):
             campaign.run(5, 1.0, certificate=CertificateOptions(kind))
     assert not campaign.trials

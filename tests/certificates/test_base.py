@@ -17,7 +17,7 @@ from ctxval.certificates import (
     KINDS,
     Certificate,
     CertificateKind,
-    Posterior,
+    DistanceBound,
     Sample,
     SamplingDiscarding,
     Scenario,
@@ -131,7 +131,7 @@ def test_the_kinds_of_this_package_are_listed_by_name() -> None:
     assert list(KINDS) == sorted(KINDS)
     assert len(KINDS) == len(list(KINDS))
     assert "posteriour" not in KINDS
-    assert KINDS["posterior"] is Posterior
+    assert KINDS["posterior"] is DistanceBound
 
 
 def test_which_kinds_have_a_use_for_an_option_follows_from_their_fields() -> None:
@@ -216,11 +216,11 @@ def test_a_certificate_of_an_unknown_kind_rests_on_what_it_assumes() -> None:
     "make",
     [
         lambda: certificates.CertificateOptions("posterior"),
-        lambda: certificates.CertificateOptions(Posterior),
+        lambda: certificates.CertificateOptions(DistanceBound),
         lambda: certificates.CertificateOptions(confidence="high"),
         lambda: certificates.CertificateOptions(volume=True),
-        lambda: Posterior(resolution="fine"),
-        lambda: Posterior(resolution="no"),
+        lambda: DistanceBound(resolution="fine"),
+        lambda: DistanceBound(resolution="no"),
     ],
 )
 def test_options_of_another_type_are_refused(make: Any) -> None:

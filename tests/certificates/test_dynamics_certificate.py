@@ -16,10 +16,10 @@ from ctxval.certificates import (
     Automatic,
     CertificateKind,
     CertificateOptions,
+    DistanceBound,
     Dynamics,
     DynamicsEvidence,
     Forecast,
-    Posterior,
     Provenance,
     Sample,
     certify_dynamics,
@@ -29,7 +29,7 @@ from ctxval.certificates.dynamics import bound_of
 from ctxval.certificates.dynamics_diagnostics import ACCURATE, GAP, PREDICTIONS
 from ctxval.certificates.sentences.verdicts import undecided
 from ctxval.certificates.verdict import judge, judge_by
-from ctxval.core.coverage import StatePocket
+from ctxval.core.coverage import UnvisitedRegion
 from ctxval.core.learned_numbers import PushedDistances
 from ctxval.errors import CertificateError
 from rig_evidence import COVERED, GOOD, gap, prediction
@@ -149,7 +149,9 @@ def test_many_coordinates_are_said_not_to_be_covered_jointly() -> None:
 
 
 def test_it_is_raised_by_what_a_deeper_search_finds() -> None:
-    usual, raised = (certify_dynamics(sample(), replace(GOOD, dense=True, missed=one)) for one in (1.0, 1.04))
+    usual, raised = (
+        certify_dynamics(sample(), replace(GOOD, low_dimensional=True, search_shortfall=one)) for one in (1.0, 1.04)
+    )
     assert raised.doubt is None
     assert raised.upper_bound == pytest.approx(1.04 * usual.upper_bound)
 
@@ -219,7 +221,7 @@ def test_auto_uses_the_dynamics_if_they_decide_and_the_distance_otherwise() -> N
     noisy = Provenance(learned=Learned(replace(GOOD, noise=0.5, maxima=GOOD.maxima + 1)))
     assert judge(trials(9), 1.1, chosen, noisy).certificate.kind == "posterior"  # type: ignore[union-attr]
     alone = judge(trials(9), 1.1, chosen)
-    assert alone.reason == judge(trials(9), 1.1, CertificateOptions(Posterior())).reason
+    assert alone.reason == judge(trials(9), 1.1, CertificateOptions(DistanceBound())).reason
 
 
 @pytest.mark.usefixtures("few_draws")
@@ -229,8 +231,8 @@ def test_auto_uses_the_dynamics_if_they_decide_and_the_distance_otherwise() -> N
 def test_auto_says_what_the_dynamics_lack_if_too_many_executions_would_cover_the_tasks(
     dimension: int, held: bool, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    computed, certify_drawn = [], Posterior.certify_drawn
-    monkeypatch.setattr(Posterior, "certify_drawn", lambda *given: computed.append(1) or certify_drawn(*given))
+    computed, certify_drawn = [], DistanceBound.certify_drawn
+    monkeypatch.setattr(DistanceBound, "certify_drawn", lambda *given: computed.append(1) or certify_drawn(*given))
     points = np.random.default_rng(3).random((9, dimension))
     executed = [replace(trial, unit_point=point) for trial, point in zip(trials(9), points, strict=True)]
     checked = [prediction(k, 0.5 if held else 0.1) for k in range(6)]
@@ -315,40 +317,42 @@ def test_a_validation_says_what_it_survives() -> None:
     ("pocket", "sentence"),
     [
         (
-            StatePocket(0.2, {"x [m]": 0.55, "y [m]": -0.35}, {"x [m]": 0.2, "y [m]": 0.2}),
+            UnvisitedRegion(0.2, {"x [m]": 0.55, "y [m]": -0.35}, {"x [m]": 0.2, "y [m]": 0.2}),
             "The least tested place is x 0.55 m, y -0.35 m: predicted runs lead there, and no execution came within "
             "0.2 m.",
         ),
         (
-            StatePocket(0.1, {"angle [rad]": 1.0, "z": 2.0}, {"angle [rad]": 0.3, "z": 4.0}),
+            UnvisitedRegion(0.1, {"angle [rad]": 1.0, "z": 2.0}, {"angle [rad]": 0.3, "z": 4.0}),
             "The least tested place is angle 1 rad, z 2: predicted runs lead there, and no execution came within 0.3 "
             "rad in angle and 4 in z.",
         ),
     ],
 )
 def test_a_validation_names_the_largest_region_that_no_execution_has_entered(
-    pocket: StatePocket, sentence: str
+    pocket: UnvisitedRegion, sentence: str
 ) -> None:
-    evidence = replace(GOOD, pocket=pocket)
+    evidence = replace(GOOD, unvisited_region=pocket)
     known = DynamicsEvidence.from_json(json.loads(json.dumps(evidence.to_json())))
     assert known is not None
-    assert known.pocket == pocket
+    assert known.unvisited_region == pocket
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(known)))
     assert verdict.certificate is not None
-    assert verdict.certificate.details["pocket"]["within"] == pocket.within
+    assert verdict.certificate.details["unvisited_region"]["within"] == pocket.within
     assert sentence in str(verdict)
 
 
 def test_a_place_of_a_position_that_no_execution_has_entered_withdraws_the_bound() -> None:
-    pocket = StatePocket(0.2, {"x [m]": 0.55, "y [m]": -0.35}, {"x [m]": 0.2, "y [m]": 0.2}, ((0.5, 0.5), (0.1, 0.9)))
-    evidence = replace(GOOD, pocket=pocket)
+    pocket = UnvisitedRegion(
+        0.2, {"x [m]": 0.55, "y [m]": -0.35}, {"x [m]": 0.2, "y [m]": 0.2}, ((0.5, 0.5), (0.1, 0.9))
+    )
+    evidence = replace(GOOD, unvisited_region=pocket)
     known = DynamicsEvidence.from_json(json.loads(json.dumps(evidence.to_json())))
     assert known is not None
-    assert known.pocket == pocket
+    assert known.unvisited_region == pocket
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(known)))
     assert verdict.answer == "undecided"
     assert "no execution came within 0.2 m of x 0.55 m, y -0.35 m" in verdict.reason
-    small = replace(evidence, pocket=replace(pocket, size=0.1))
+    small = replace(evidence, unvisited_region=replace(pocket, size=0.1))
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(small)))
     assert verdict.answer == "validated"
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctxval.certificates import CheckedPrediction, DynamicsEvidence, UntriedCorner, UntriedParameter
+from ctxval.certificates import CheckedPrediction, DynamicsEvidence, UnsampledCorner, UnsampledParameter
 from ctxval.certificates.dynamics_diagnostics import (
     ACCURATE,
     AGREE,
@@ -63,18 +63,21 @@ BAD: list[tuple[dict[str, Any], str]] = [
         {"coverage": replace(COVERED, pair=gap(1.1 * PAIR_GAP, "x[0]", "u[0]"))},
         "enter a gap in the joint records of x[0] and u[0] by 55 % (at x[0] 1, u[0] 3)",
     ),
-    ({"untried": UntriedParameter("load", 1.1 * GAP, np.zeros(2))}, "the parameter load hardly changes"),
-    ({"corner": UntriedCorner({"x [m]": 1.0, "y [m]": -1.0}, 1.1 * CORNER, np.zeros(2))}, "the corner x 1 m, y -1 m"),
+    ({"unsampled_parameter": UnsampledParameter("load", 1.1 * GAP, np.zeros(2))}, "the parameter load hardly changes"),
+    (
+        {"unsampled_corner": UnsampledCorner({"x [m]": 1.0, "y [m]": -1.0}, 1.1 * CORNER, np.zeros(2))},
+        "the corner x 1 m, y -1 m",
+    ),
     ({"highest": 1.1 * BEST / TESTED}, "predicted to be 1.1, but the largest executed one is 0.8"),
     ({"predictions": (prediction(1, 0.9 * MATTERS, 0.9 * MATTERS),) * 3}, "small distances hardly test it"),
     (
         {"tests": 8, "predictions": (*GOOD.predictions, *TESTS[:7])},
         "at least 1 more execution must be predicted beforehand",
     ),
-    ({"sharpness": 1.4 * SHARP}, "one of the largest predicted distances falls by 7 %"),
+    ({"peak_ratio": 1.4 * SHARP}, "one of the largest predicted distances falls by 7 %"),
     ({"jump": 2 * JUMP}, "the predicted distance jumps by up to 2 % of the bound"),
-    ({"dense": True, "missed": 1 + 1.4 * AGREE}, "largest distances that differ by 7 %"),
-    ({"dense": True, "disagreement": 1.4 * AGREE}, "largest distances that differ by 7 %"),
+    ({"low_dimensional": True, "search_shortfall": 1 + 1.4 * AGREE}, "largest distances that differ by 7 %"),
+    ({"low_dimensional": True, "disagreement": 1.4 * AGREE}, "largest distances that differ by 7 %"),
 ]
 """What withdraws the bound, and what is said then, in the order in which it is said."""
 
@@ -188,10 +191,10 @@ def test_many_coordinates_may_leave_their_ranges_as_far_as_they_may_leave_gaps()
     assert "leave the recorded range" in (doubt(coverage=replace(wide, beyond=gap(1.1 * GAP))) or "")
 
 
-@pytest.mark.parametrize("jumps", [{"sharpness": 1.4 * SHARP}, {"jump": 2 * JUMP}])
+@pytest.mark.parametrize("jumps", [{"peak_ratio": 1.4 * SHARP}, {"jump": 2 * JUMP}])
 def test_jumps_withdraw_nothing_if_they_are_small_or_searched_more_deeply(jumps: dict[str, float]) -> None:
     assert "use a smoother model, or an audit" in (doubt(**jumps) or "")
-    assert doubt(dense=True, **jumps) is None
+    assert doubt(low_dimensional=True, **jumps) is None
     assert doubt(**{name: 0.1 * value for name, value in jumps.items()}) is None
 
 
@@ -222,8 +225,8 @@ def test_a_test_that_failed_is_outlived_by_tests_and_not_by_other_executions() -
 
 
 def test_a_parameter_that_m_ignores_needs_twice_as_many_tests() -> None:
-    ignored = replace(GOOD, untried=UntriedParameter("load", 0.1, np.zeros(2), idle=True))
-    obstacle = replace(GOOD, untried=UntriedParameter("obstacle", 0.1, np.zeros(2)))
+    ignored = replace(GOOD, unsampled_parameter=UnsampledParameter("load", 0.1, np.zeros(2), idle=True))
+    obstacle = replace(GOOD, unsampled_parameter=UnsampledParameter("obstacle", 0.1, np.zeros(2)))
     assert [evidence.needing(8).tests for evidence in (GOOD, obstacle, ignored)] == [8, 8, 16]
     assert ignored.needing(22).tests == 22  # independent draws
     assert ignored.needing(0).tests == 0

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval.certificates import (
+    DistanceBound,
     Maxima,
-    Posterior,
     Sample,
     draw_maxima,
     settle_maxima,
@@ -77,7 +77,7 @@ def test_the_rank_is_that_of_exchangeable_draws() -> None:
 @pytest.mark.parametrize("confidence", [0.0, 1.0, -0.1, 1.5, np.nan])
 def test_a_confidence_that_is_no_probability_is_refused(confidence: float) -> None:
     with pytest.raises(InputError, match="strictly between 0 and 1"):
-        Posterior().certify(sample(), confidence)
+        DistanceBound().certify(sample(), confidence)
 
 
 # The draws
@@ -91,7 +91,7 @@ def test_no_bound_is_below_the_largest_distance_that_was_executed(d: int) -> Non
     assert maxima.draws[0] >= trials.best
     assert (np.diff(maxima.draws) >= 0).all()
     assert ((maxima.points >= 0) & (maxima.points <= 1)).all()
-    assert Posterior().certify_drawn(trials, maxima, 0.01).upper_bound >= trials.best
+    assert DistanceBound().certify_drawn(trials, maxima, 0.01).upper_bound >= trials.best
 
 
 @pytest.mark.thorough
@@ -153,7 +153,7 @@ def test_noise_widens_what_is_expected_and_may_stay_below_the_largest_value_seen
     mean = 3 + 0.5 * np.sin(3 * X[:, 0])
     noisy = Sample(X, mean + 0.5 * rng.normal(size=40), ["iid"] * 40, ["completed"] * 40)
     maxima = quick(noisy, stochastic=True)
-    certificate = Posterior().certify_drawn(noisy, maxima, 0.9)
+    certificate = DistanceBound().certify_drawn(noisy, maxima, 0.9)
     assert 3.5 < certificate.upper_bound < noisy.best
     assert "expected distance" in certificate.statement
     assert any("noise" in line for line in certificate.assumptions)
@@ -283,7 +283,7 @@ def test_many_trials_are_represented_by_the_largest_and_well_spread_ones() -> No
 @pytest.mark.thorough
 def test_a_bound_of_many_trials_says_that_it_uses_some_of_them() -> None:
     many = sample(400)
-    certificate = Posterior().certify_drawn(many, quick(many), 0.9)
+    certificate = DistanceBound().certify_drawn(many, quick(many), 0.9)
     assert certificate.trials == 400
     assert "conditioned on 160 of the 400 trials" in " ".join(certificate.assumptions)
     assert certificate.upper_bound >= many.best
@@ -291,4 +291,4 @@ def test_a_bound_of_many_trials_says_that_it_uses_some_of_them() -> None:
 
 def test_many_trials_that_do_not_cover_the_tasks_are_refused_before_the_draws() -> None:
     with pytest.raises(CertificateError, match=r"away from each of 400 trials.*is not computed"):
-        Posterior().certify(sample(400, 5))
+        DistanceBound().certify(sample(400, 5))

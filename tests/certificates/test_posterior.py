@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import kstest, t
 
 from ctxval import Trial
-from ctxval.certificates import MadeGood, Maxima, Posterior, Sample, diagnose, draw_maxima
+from ctxval.certificates import DistanceBound, Maxima, RecoveredFailure, Sample, diagnose, draw_maxima
 from ctxval.errors import CertificateError
 from ctxval.gp.hyperposterior import EXACT, Conditioned, Hyperparameters, condition
 
@@ -26,7 +26,7 @@ def quick(trials: Sample, seed: int = 0, stochastic: bool = False) -> Maxima:
 
 def test_a_certificate_says_everything_and_is_ready_for_json() -> None:
     trials = sample()
-    certificate = Posterior().certify_drawn(trials, quick(trials), 0.9)
+    certificate = DistanceBound().certify_drawn(trials, quick(trials), 0.9)
     back = json.loads(json.dumps(certificate.to_json(), allow_nan=False))
     assert (back["kind"], back["confidence"], back["volume"], back["trials"]) == ("posterior", 0.9, 0.0, 9)
     assert back["details"]["best"] == trials.best
@@ -41,7 +41,7 @@ def test_a_certificate_says_everything_and_is_ready_for_json() -> None:
 def test_a_certificate_says_its_error() -> None:
     trials = sample(6)
     maxima = quick(trials)
-    certificate = Posterior(resolution=1.0).certify_drawn(trials, maxima, 0.8)
+    certificate = DistanceBound(resolution=1.0).certify_drawn(trials, maxima, 0.8)
     assert certificate.error == certificate.details["error"] == maxima.error(0.8) > 0
     assert "±" in certificate.statement
     assert "standard error of the random draws" in certificate.statement
@@ -57,7 +57,7 @@ def test_a_bound_that_a_far_task_withdraws_is_not_settled(monkeypatch: pytest.Mo
     )
     trials = sample()
     bound = quick(trials).upper(0.9)
-    near, far = (Posterior(resolution).certify(replace(trials, threshold=bound), 0.9) for resolution in (1.0, 1e-3))
+    near, far = (DistanceBound(resolution).certify(replace(trials, threshold=bound), 0.9) for resolution in (1.0, 1e-3))
     assert (near.doubt, settled) == (None, [1])
     assert far.doubt is not None
 
@@ -68,18 +68,18 @@ def test_a_bound_that_a_far_task_withdraws_is_not_settled(monkeypatch: pytest.Mo
 def made_good(because: str | None) -> Sample:
     trials = sample()
     parts = (trials.points, trials.distances, trials.origins, trials.states, trials.numbers)
-    return Sample(*parts, made_good=(MadeGood(2, 7, because),))
+    return Sample(*parts, made_good=(RecoveredFailure(2, 7, because),))
 
 
 @pytest.mark.parametrize("stochastic", [False, True])
 def test_a_failure_made_good_for_no_stated_reason_withdraws_the_bound(stochastic: bool) -> None:
     found = quick(sample(), stochastic=stochastic)
-    certificate = Posterior(resolution=1.0).certify_drawn(made_good(None), found, 0.9)
+    certificate = DistanceBound(resolution=1.0).certify_drawn(made_good(None), found, 0.9)
     assert not certificate.covers(1e9)
     assert certificate.doubt is not None
     assert "trial 2 failed and trial 7 executed the same task with success, for no stated reason" in certificate.doubt
     assert '--again 2 --because "what was changed"' in certificate.doubt
-    explained = Posterior(resolution=1.0).certify_drawn(made_good("fuse replaced"), found, 0.9)
+    explained = DistanceBound(resolution=1.0).certify_drawn(made_good("fuse replaced"), found, 0.9)
     assert explained.covers(1e9)
     assert any("fuse replaced" in sentence for sentence in explained.assumptions)
     assert explained.details["failures"]["made_good"] == [{"trial": 2, "by": 7, "because": "fuse replaced"}]
@@ -115,7 +115,7 @@ def test_the_order_of_imported_rows_changes_nothing(spike: float) -> None:
         trials = Sample.of(imported(order, spike))
         for stochastic in (False, True):
             maxima = quick(trials, stochastic=stochastic)
-            made = Posterior().certify_drawn(trials, maxima, 0.8)
+            made = DistanceBound().certify_drawn(trials, maxima, 0.8)
             found.append((stochastic, made.upper_bound, made.error, made.doubt is None))
     assert len(set(found)) == 2
     assert {one[0]: one[3] for one in found}[False] == (spike == 0)
@@ -137,7 +137,7 @@ def test_the_test_of_unordered_trials_sees_as_much_as_that_of_trials_in_order() 
         ):
             trials = Sample(X[rows][:, None], y[rows], [origin] * 25, ["completed"] * 25)  # type: ignore[list-item]
             fired[name] += (
-                Posterior().certify_drawn(trials, draw_maxima(trials, draws=12, paths=1), 0.8).doubt is not None
+                DistanceBound().certify_drawn(trials, draw_maxima(trials, draws=12, paths=1), 0.8).doubt is not None
             )
     assert fired["worst first"] == 0
     assert fired["unordered"] >= max(4, fired["in order"])
@@ -204,7 +204,7 @@ def spiked(height: float) -> tuple[np.ndarray, np.ndarray]:
 def test_a_spike_that_nothing_announced_withdraws_the_bound(height: float, believed: bool) -> None:
     X, y = spiked(height)
     sample = Sample(X, y, ["acquisition"] * len(y), ["completed"] * len(y))
-    certificate = Posterior().certify_drawn(sample, draw_maxima(sample, draws=12, paths=2), 0.9)
+    certificate = DistanceBound().certify_drawn(sample, draw_maxima(sample, draws=12, paths=2), 0.9)
     assert (certificate.doubt is None) == believed
     assert certificate.covers(1e6) == believed
     if not believed:

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval import Trial
-from ctxval.certificates import MadeGood, Sample
+from ctxval.certificates import RecoveredFailure, Sample
 from ctxval.certificates.sample import listed
 from ctxval.core.trial import Origin, State
 
@@ -31,7 +31,7 @@ def trial(
 def test_a_failure_made_good_is_kept_with_its_reason() -> None:
     again = [trial(0, 0.1, None), trial(1, 0.1, None), trial(2, 0.5, 0.3), trial(3, 0.1, 0.2, because="fuse replaced")]
     sample = Sample.of(again)
-    assert sample.made_good == (MadeGood(0, 3, "fuse replaced"), MadeGood(1, 3, "fuse replaced"))
+    assert sample.made_good == (RecoveredFailure(0, 3, "fuse replaced"), RecoveredFailure(1, 3, "fuse replaced"))
     assert sample.remarks == (
         "2 trials (0, 1) failed, and trial 3 executed the same task with success; you state why: 'fuse replaced'",
     )
@@ -40,8 +40,8 @@ def test_a_failure_made_good_is_kept_with_its_reason() -> None:
 
 def test_of_several_successes_the_one_with_a_reason_counts() -> None:
     trials = [trial(0, 0.1, None), trial(1, 0.1, 0.2), trial(2, 0.1, 0.2, because="cable fixed")]
-    assert Sample.of(trials).made_good == (MadeGood(0, 2, "cable fixed"),)
-    assert Sample.of(trials[:2]).made_good == (MadeGood(0, 1, None),)
+    assert Sample.of(trials).made_good == (RecoveredFailure(0, 2, "cable fixed"),)
+    assert Sample.of(trials[:2]).made_good == (RecoveredFailure(0, 1, None),)
     assert "nobody stated why" in Sample.of(trials[:2]).remarks[0]
 
 

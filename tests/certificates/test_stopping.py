@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ctxval import Trial
-from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.certificates.stopping import StoppingRule
 from ctxval.certificates.verdict import judge
 
@@ -23,7 +23,7 @@ def test_a_corner_that_a_trial_is_only_near_to_is_executed_before_anything_is_va
     assert not now.decided
     assert now.next_point is not None
     assert now.next_point.tolist() == [1.0]
-    by_distance = CertificateOptions(Posterior())
+    by_distance = CertificateOptions(DistanceBound())
     verdict = judge(known, 0.9, by_distance)
     assert verdict.answer == "undecided"
     assert "1 of the 2 ends of the task parameter's range" in verdict.reason

@@ -11,8 +11,8 @@ from ctxval.certificates import (
     Audit,
     Automatic,
     CertificateOptions,
+    DistanceBound,
     Dynamics,
-    Posterior,
     Provenance,
     Sample,
     WholeSuite,
@@ -64,8 +64,8 @@ def test_one_execution_above_the_threshold_falsifies_also_if_it_was_predicted_to
     assert "task 'run 1'" in verdict.reason
 
 
-@pytest.mark.parametrize("kind", [Posterior(), Audit()])
-def test_other_kinds_are_refused(kind: Posterior | Audit) -> None:
+@pytest.mark.parametrize("kind", [DistanceBound(), Audit()])
+def test_other_kinds_are_refused(kind: DistanceBound | Audit) -> None:
     verdict = judge(trials(0.1, 0.2, 0.3, 0.4), 0.5, CertificateOptions(kind), KNOWN)
     assert verdict.answer == "undecided"
     assert "use one of auto, dynamics, suite" in verdict.reason
@@ -82,4 +82,4 @@ def test_a_box_cannot_be_executed_as_a_whole() -> None:
 
 def test_kinds_for_suites_say_so() -> None:
     assert all(kind.takes_suites for kind in (Automatic, Dynamics, WholeSuite))
-    assert not Posterior.takes_suites
+    assert not DistanceBound.takes_suites

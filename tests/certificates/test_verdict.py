@@ -15,8 +15,8 @@ from ctxval.certificates import (
     Certificate,
     CertificateKind,
     CertificateOptions,
+    DistanceBound,
     Neighbour,
-    Posterior,
     Provenance,
     Sample,
     Scenario,
@@ -34,7 +34,7 @@ WORST = 1.0
 
 
 def posterior(confidence: float = 0.95, resolution: float = RESOLUTION) -> CertificateOptions:
-    return CertificateOptions(Posterior(resolution), confidence)
+    return CertificateOptions(DistanceBound(resolution), confidence)
 
 
 def trial(
@@ -201,7 +201,7 @@ def test_a_counterexample_needs_no_certificate_and_no_model() -> None:
 @pytest.mark.slow
 def test_undecided_says_what_more_would_take() -> None:
     known = trials(5)
-    upper = Posterior().certify(Sample.of(known)).upper_bound
+    upper = DistanceBound().certify(Sample.of(known)).upper_bound
     tau = 0.5 * (upper + max(t.distance or 0.0 for t in known))
     verdict = judge(known, tau)
     assert verdict.answer == "undecided"
@@ -259,7 +259,7 @@ def repeated(executed: Trial) -> Trial:
 @pytest.mark.thorough
 def test_decided_is_what_the_verdict_is_not_undecided_of(stochastic: bool) -> None:
     known = [*trials(6), *([repeated(trials(6)[2])] if stochastic else [])]
-    upper = Posterior().certify(Sample.of(known), 0.95).upper_bound
+    upper = DistanceBound().certify(Sample.of(known), 0.95).upper_bound
     best = max(t.distance or 0.0 for t in known)
     for threshold in (0.9 * best, 1.02 * upper, best + 0.2 * (upper - best)):
         verdict = judge(known, threshold, posterior())

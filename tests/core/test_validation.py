@@ -564,7 +564,7 @@ def test_a_task_that_keeps_an_array_of_its_function_does_not_change_with_it() ->
 
 def test_a_plan_that_people_hold_cannot_be_changed() -> None:
     plan = make_validation().plan(make_validation().space.low)
-    promised = plan.model_trajectory
-    for array in (promised.times, promised.states, promised.inputs, plan.task.reference, plan.parameters.points):
+    nominal = plan.model_trajectory
+    for array in (nominal.times, nominal.states, nominal.inputs, plan.task.reference, plan.parameters.points):
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 0.0

@@ -112,10 +112,12 @@ def test_the_elites_of_several_hills_are_on_all_of_them() -> None:
         return np.asarray(np.linalg.norm(X[:, None] - hills, axis=2))
 
     found = search(lambda X: (heights * np.exp(-((distances(X) / 0.15) ** 2))).max(axis=1), 3)
-    assert (distances(found.elites).min(axis=0) < 0.02).all()
-    apart = np.linalg.norm(found.elites[:, None] - found.elites, axis=2)[np.triu_indices(len(found.elites), 1)]
+    assert (distances(found.local_maxima).min(axis=0) < 0.02).all()
+    apart = np.linalg.norm(found.local_maxima[:, None] - found.local_maxima, axis=2)[
+        np.triu_indices(len(found.local_maxima), 1)
+    ]
     assert apart.min() > 0.1
-    np.testing.assert_array_equal(found.elites[0], found.points[0])
+    np.testing.assert_array_equal(found.local_maxima[0], found.points[0])
 
 
 @pytest.mark.parametrize("dimension", [2, 5])
@@ -123,13 +125,13 @@ def test_what_is_not_finite_is_no_maximum(dimension: int) -> None:
     found = search(lambda X: np.where(X[:, 0] > 0.5, np.nan, X[:, 0]), dimension)
     assert 0.49 < found.points[0, 0] <= 0.5
     assert found.values[0] == found.points[0, 0]
-    assert (found.elites[:, 0] <= 0.5).all()
+    assert (found.local_maxima[:, 0] <= 0.5).all()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_without_any_finite_value_there_are_no_elites(value: float) -> None:
     found = search(lambda X: np.full(len(X), value), 3, evaluations=500)
-    assert found.elites.shape == (0, 3)
+    assert found.local_maxima.shape == (0, 3)
     assert (found.values == -np.inf).all()
 
 
@@ -170,6 +172,6 @@ def test_batches_are_few_and_no_larger_than_a_tenth() -> None:
 def test_the_same_randomness_finds_the_same_points() -> None:
     first, again = (search(lambda X: np.sin(9 * X).prod(axis=1), 5, seed=3) for _ in range(2))
     np.testing.assert_array_equal(first.points, again.points)
-    np.testing.assert_array_equal(first.elites, again.elites)
+    np.testing.assert_array_equal(first.local_maxima, again.local_maxima)
     other = search(lambda X: np.sin(9 * X).prod(axis=1), 5, seed=4)
     assert not np.array_equal(first.points, other.points)

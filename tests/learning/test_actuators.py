@@ -84,8 +84,8 @@ def test_what_m_promises_is_what_it_promises_without_an_actuator() -> None:
         LoopPlanner(validation).plan(points)
         for validation in (plain, ExtendedValidation(plain, Actuator(2.0), 1).validation)
     )
-    np.testing.assert_array_equal(other.promised.states, one.promised.states)
-    np.testing.assert_array_equal(other.promised.inputs[..., 1:], one.promised.inputs)
+    np.testing.assert_array_equal(other.nominal.states, one.nominal.states)
+    np.testing.assert_array_equal(other.nominal.inputs[..., 1:], one.nominal.inputs)
 
 
 @pytest.mark.slow

@@ -12,11 +12,10 @@ from ctxval._util.arrays import Array
 from ctxval.core.coverage import StateInputCoverage
 from ctxval.learning.closed_loops import LoopPlanner, Loops
 from ctxval.learning.coverage import (
-    MOST_COORDINATES,
     away_from_executions,
     largest_pocket,
     position_states,
-    untried_corner,
+    unsampled_corner,
 )
 from ctxval.learning.coverage import coverage as coverage_of
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
@@ -113,9 +112,9 @@ def test_an_input_that_was_never_used_is_named() -> None:
 
 
 def test_with_many_coordinates_pairs_are_not_compared() -> None:
-    planner = make_planner(MOST_COORDINATES)
+    planner = make_planner(6)
     rng = np.random.default_rng(0)
-    posterior = learn(planner, rng.normal(size=(30, MOST_COORDINATES)), rng.normal(size=(30, 1)))
+    posterior = learn(planner, rng.normal(size=(30, 6)), rng.normal(size=(30, 1)))
     found = coverage(planner, posterior, TASKS)
     assert found.pair is None
     assert found.marginal.size > 0
@@ -313,7 +312,7 @@ def test_four_tasks_try_the_corners_of_all_positions(components: int) -> None:
     low, high = [-1.0] * components, [2.0] * components
     space = TaskSpace(load=(0, 1, "kg"), start=(low, high, "m"), goal=(low, high, "m"))
     executed = 0.3 + 0.4 * np.random.default_rng(components).random((2, space.dimension))
-    while (corner := untried_corner(executed, space, np.full(space.dimension, 0.4))) is not None:
+    while (corner := unsampled_corner(executed, space, np.full(space.dimension, 0.4))) is not None:
         assert corner.gap >= 0.3
         assert set(corner.place.values()) <= {-1.0, 2.0}
         assert corner.task[0] == 0.4
@@ -325,10 +324,10 @@ def test_four_tasks_try_the_corners_of_all_positions(components: int) -> None:
 
 
 def test_before_the_first_execution_every_corner_is_untried() -> None:
-    corner = untried_corner(np.empty((0, 2)), TaskSpace(goal=([0, 0], [1, 1], "m")), np.array([0.4, 0.6]))
+    corner = unsampled_corner(np.empty((0, 2)), TaskSpace(goal=([0, 0], [1, 1], "m")), np.array([0.4, 0.6]))
     assert corner is not None
     assert corner.gap == 1
 
 
 def test_without_a_position_no_corner_is_asked_for() -> None:
-    assert untried_corner(TASKS, TaskSpace(angles=([0, 0], [1, 1], "rad")), TASKS[0]) is None
+    assert unsampled_corner(TASKS, TaskSpace(angles=([0, 0], [1, 1], "rad")), TASKS[0]) is None

@@ -132,7 +132,7 @@ def test_maxima_are_distances_at_their_points() -> None:
     np.testing.assert_allclose(found.maxima, again, rtol=1e-7)
     assert ((found.points >= 0) & (found.points <= 1)).all()
     np.testing.assert_allclose(
-        planner.distances(posterior.mean, planner.plan(found.elites[:1]), 1), found.highest, rtol=1e-7
+        planner.distances(posterior.mean, planner.plan(found.local_maxima[:1]), 1), found.highest, rtol=1e-7
     )
     assert found.left_out == posterior.taken[0].left_out
 
@@ -143,7 +143,7 @@ def test_controllers_that_jump_from_task_to_task_are_seen(height: float, jumps: 
     search = WorstCaseSearch(jumping(height), 0, WorstCaseSettings.for_dimension(2))
     found = maxima(search, learned(), np.empty((0, 2)), np.random.default_rng(0))
     share = search.largest_jump(learned()) / found.highest
-    assert (found.sharpness > 0.05) == jumps
+    assert (found.peak_ratio > 0.05) == jumps
     assert (share > 0.01) == jumps
     if not jumps:
         assert share < 1e-3
@@ -173,7 +173,7 @@ def test_kinks_of_a_distance_that_says_so_are_no_jumps_and_jumps_are_still_seen(
     assert largest(1.0, Kinked()) > 0.2
 
 
-FEW = WorstCaseSettings(pool=64, evaluations=300, elites=6, shared=6, moves=4, relevant=100)
+FEW = WorstCaseSettings(pool=64, evaluations=300, local_maxima=6, shared=6, moves=4, relevant=100)
 
 
 @pytest.mark.slow
@@ -187,7 +187,7 @@ def test_equal_seeds_give_equal_maxima_whatever_was_computed_before() -> None:
     first, second = (maxima(one, posterior, known, np.random.default_rng(4)) for one in (used, fresh))
     np.testing.assert_array_equal(first.maxima, second.maxima)
     np.testing.assert_array_equal(first.points, second.points)
-    np.testing.assert_array_equal(first.elites, second.elites)
+    np.testing.assert_array_equal(first.local_maxima, second.local_maxima)
     other = maxima(fresh, posterior, known, np.random.default_rng(5))
     assert not np.array_equal(first.maxima, other.maxima)
 
@@ -222,7 +222,7 @@ def test_drawn_loops_that_diverge_have_an_infinite_maximum() -> None:
 def test_the_number_of_loops_is_counted() -> None:
     found = maxima(WorstCaseSearch(make_planner(2), 0, FEW), learned(), np.empty((0, 2)), np.random.default_rng(0))
     on_draws = found.evaluations - FEW.evaluations
-    each = len(found.elites) + FEW.shared + 4 * (4 + FEW.moves + 1)
+    each = len(found.local_maxima) + FEW.shared + 4 * (4 + FEW.moves + 1)
     # Each draw also tries the best tasks of the others, of which there are at most eight.
     assert 8 * (each + 1) <= on_draws <= 8 * (each + 8)
 
@@ -280,6 +280,6 @@ class Counting(LoopPlanner):
 
 def test_loops_whose_distance_is_known_are_not_run_again() -> None:
     planner = Counting(make_planner(1).validation)
-    search = WorstCaseSearch(planner, 0, WorstCaseSettings(pool=16, evaluations=80, elites=4, shared=4, rounds=3))
+    search = WorstCaseSearch(planner, 0, WorstCaseSettings(pool=16, evaluations=80, local_maxima=4, shared=4, rounds=3))
     maxima(search, learned(), np.empty((0, 1)), np.random.default_rng(0))
     assert planner.batches == 3  # with one task parameter, all moves that help together are one of the moves

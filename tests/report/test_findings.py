@@ -10,7 +10,7 @@ from rig_pages import pendulum, plane
 
 from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, searches, systems
 from ctxval._util.arrays import Array
-from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.report import ReportContext, context_of_campaign
 from ctxval.report.distance_model import DistanceModel
 from ctxval.report.findings import Answer, Finding, Question, findings_of, share_far_from_trials, smooth
@@ -34,12 +34,12 @@ def found_by(question: Question, context: ReportContext) -> Finding | None:
 
 @pytest.fixture(scope="module")
 def swing() -> ReportContext:
-    return context_of_campaign(pendulum(), threshold=0.2, certificate=CertificateOptions(Posterior()))
+    return context_of_campaign(pendulum(), threshold=0.2, certificate=CertificateOptions(DistanceBound()))
 
 
 @pytest.fixture(scope="module")
 def flat() -> ReportContext:
-    return context_of_campaign(plane(2, 24), threshold=0.02, certificate=CertificateOptions(Posterior()))
+    return context_of_campaign(plane(2, 24), threshold=0.02, certificate=CertificateOptions(DistanceBound()))
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_the_region_of_weak_tasks_is_described_by_its_parameters() -> None:
     space = TaskSpace(goal=(0.0, 2.0, "m"), load=(0.0, 1.0))
     # The distance is |goal - 1|, and the load does not matter.
     campaign = Campaign(distance_of_goal(space), search=searches.Random(), seed=0).run(30)
-    context = context_of_campaign(campaign, threshold=0.8, certificate=CertificateOptions(Posterior()))
+    context = context_of_campaign(campaign, threshold=0.8, certificate=CertificateOptions(DistanceBound()))
     found = found_by(weak_region, context)
     assert found is not None
     model = context.distance_model

@@ -12,7 +12,7 @@ from rig_pages import hostile_store, pendulum, plane
 
 from browser import accessibility_findings
 from ctxval import Campaign, Store, cases, searches
-from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.report import ReportContext, context_of_campaign, context_of_store, write_page
 from rig_thorough import more
 
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.slow
 def case(name: str, executions: int) -> ReportContext:
     experiment = cases.by_name(name)
     campaign = Campaign(experiment.validation, search=searches.Random(), seed=0, name=experiment.name).run(executions)
-    options = CertificateOptions(Posterior())
+    options = CertificateOptions(DistanceBound())
     return context_of_campaign(campaign, threshold=experiment.threshold, certificate=options)
 
 
@@ -117,7 +117,7 @@ def test_a_report_is_quiet_small_and_accessible(name: str, browser: Any, tmp_pat
 
 @pytest.fixture(scope="module")
 def swing(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Opened, ReportContext]]:
-    context = context_of_campaign(pendulum(), threshold=0.2, certificate=CertificateOptions(Posterior()))
+    context = context_of_campaign(pendulum(), threshold=0.2, certificate=CertificateOptions(DistanceBound()))
     path = write_page(context, tmp_path_factory.mktemp("swing") / "report.html")
     opened = Opened(browser, path)
     opened.unfold()

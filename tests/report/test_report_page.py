@@ -17,14 +17,14 @@ import pytest
 from rig_pages import HOSTILE, hostile_store, pendulum, plane
 
 from ctxval import Campaign, Trial, report
-from ctxval.certificates import CertificateOptions, Posterior, Region
+from ctxval.certificates import CertificateOptions, DistanceBound, Region
 from ctxval.errors import InputError
 from ctxval.report import ReportContext, context_of_campaign, context_of_store
 from ctxval.report.sections.repeat import command_of, identity, python_snippet
 from ctxval.report.sections.trials import packed, recorded_lines
 from rig_thorough import more
 
-POSTERIOR = CertificateOptions(Posterior())
+POSTERIOR = CertificateOptions(DistanceBound())
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import pytest
 from conftest import make_validation
 from ctxval import Campaign, Task, Trajectory
 from ctxval._util.arrays import Array
-from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.core.controller import Controller
 from ctxval.errors import InputError
 from ctxval.searches import GPUCB, Auto, BayesianOptimisation, Random, Repeated, by_name
@@ -94,7 +94,7 @@ def test_a_campaign_estimates_the_largest_mean_distance() -> None:
     assert (goals == goals[:, :1]).all()
     means = np.array([trial.distance for trial in campaign.trials], dtype=float).reshape(5, 3).mean(axis=1)
     assert campaign.estimate == pytest.approx(means.max())
-    by_distance = CertificateOptions(Posterior(1.0))
+    by_distance = CertificateOptions(DistanceBound(1.0))
     assert campaign.verdict(50.0, certificate=by_distance).answer == "validated"
 
 

@@ -81,7 +81,8 @@ class Registry(Mapping[str, Any], Generic[Made]):
     def _exported(self) -> dict[str, Any]:
         exported = {} if self._modules is not None else vars(sys.modules[self.group])
         parts = [exported.get(name) for name in exported.get("__all__", ())]
-        return {declared.name: made for made in parts if (declared := declaration_of(made)) is not None}
+        named = {declared.name: made for made in parts if (declared := declaration_of(made)) is not None}
+        return dict(sorted(named.items()))
 
     @property
     def built_in(self) -> tuple[str, ...]:

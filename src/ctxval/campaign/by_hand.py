@@ -38,10 +38,10 @@ def write_files(folder: Path, experiment: Experiment, opened: OpenTrial) -> list
         folder.parent.mkdir(parents=True, exist_ok=True)
         fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
         try:
-            plan, promised = opened.plan, opened.plan.model_trajectory
-            states, inputs = experiment.names(promised.states.shape[-1], promised.inputs.shape[-1])
+            plan, nominal = opened.plan, opened.plan.model_trajectory
+            states, inputs = experiment.names(nominal.states.shape[-1], nominal.inputs.shape[-1])
             write_task(fresh / "task.json", experiment.validation.recorded_task(plan.task), states=states)
-            promised.to_csv(fresh / "model.csv", states=list(states), inputs=list(inputs))
+            nominal.to_csv(fresh / "model.csv", states=list(states), inputs=list(inputs))
             names = ["task.json", "model.csv"]
             if isinstance(plan.controller, AffineFeedback):
                 for name in ("controller.json", "controller.npz"):

@@ -46,9 +46,9 @@ class ThinkingCosts:
         loop = min(_seconds(lambda: validation.closed_loop(controller, task)) for _ in range(3))
         made_up = []
         for point in points:  # trajectories that differ from those of M by a tenth of the range of each state
-            promised = validation.plan(point).model_trajectory
-            away = 0.1 * np.ptp(promised.states, axis=0) * np.sin(np.linspace(0, 3, promised.horizon + 1))[:, None]
-            made_up.append((validation.space.to_unit(point), replace(promised, states=promised.states + away)))
+            nominal = validation.plan(point).model_trajectory
+            away = 0.1 * np.ptp(nominal.states, axis=0) * np.sin(np.linspace(0, 3, nominal.horizon + 1))[:, None]
+            made_up.append((validation.space.to_unit(point), replace(nominal, states=nominal.states + away)))
         begun, study = _now(), DynamicsStudy(validation)
         learned = study.learn(made_up)
         prediction = study.prediction_of(learned, made_up)

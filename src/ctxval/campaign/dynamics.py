@@ -27,7 +27,7 @@ from ctxval.core.trial import REDEFINED, Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
-from ctxval.learning.coverage import untried_corner
+from ctxval.learning.coverage import unsampled_corner
 from ctxval.learning.precision import SHARE
 from ctxval.learning.prediction import Executed
 from ctxval.learning.worst_case import WorstCase, is_kinked
@@ -63,7 +63,7 @@ class CampaignDynamics:
         text = json.dumps(identity, sort_keys=True)
         self.experiment = hashlib.sha256(text.encode()).hexdigest()[:16]
         self._store = store
-        self.elsewhere: Callable[[], Sequence[Trajectory]] = tuple
+        self.extra_recordings: Callable[[], Sequence[Trajectory]] = tuple
         self.failure: str | None = None
         self._use(DynamicsStudy(validation, seed))
 
@@ -76,13 +76,13 @@ class CampaignDynamics:
     def use_quantile(self, quantile: float) -> None:
         """State the share of the executions of a task that distances are about, if the system is noisy."""
         if quantile != self.study.quantile:
-            self._use(self.study.anew(quantile))
+            self._use(self.study.fresh_copy(quantile))
 
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
         """Return what the completed trials, and unless ``alone`` other recordings teach; None if it is nothing."""
-        executed, others = executed_trials(self._store, trials), () if alone else self.elsewhere()
+        executed, others = executed_trials(self._store, trials), () if alone else self.extra_recordings()
         if self._parts is not None and self._parts != self.study.state_of_parts():  # they were changed in place
-            self._use(self.study.anew())
+            self._use(self.study.fresh_copy())
         # The other recordings are kept with what they taught, so that their identities stay theirs. A result may be
         # replaced, and then has another distance.
         allowed = self._allowed(trials)
@@ -135,7 +135,7 @@ class CampaignDynamics:
 
     def _as_if(self, learned: LearnedDynamics, executed: Executed, waiting: Array) -> LearnedDynamics | None:
         try:
-            return self.study.as_if_executed(learned, executed, learned.trajectories(waiting), self.elsewhere())
+            return self.study.as_if_executed(learned, executed, learned.trajectories(waiting), self.extra_recordings())
         except Exception:  # users' parts
             return None
 
@@ -178,13 +178,13 @@ class CampaignDynamics:
                 evidence = None if learned is None else self._whole(learned, trials, confidence)
             except Exception as error:  # users' parts
                 self.failure, evidence = reason_of(error), None
-        if keep and evidence is not None and not self.elsewhere():
+        if keep and evidence is not None and not self.extra_recordings():
             self._store.keep_computed(self._key(trials, confidence), evidence.to_json(), digest)
         return evidence
 
     def kept_evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
         """Return :meth:`evidence` that the store keeps for these trials; None if there is none."""
-        if self.elsewhere():
+        if self.extra_recordings():
             return None
         return DynamicsEvidence.from_json(self._store.computed(self._key(trials, confidence)))
 
@@ -213,15 +213,21 @@ class CampaignDynamics:
             return replace(evidence, **further)
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         jump = learned.study.search.largest_jump(drawn_from)
-        further |= {"jump": jump, "pocket": learned.pocket}
+        further |= {"jump": jump, "unvisited_region": learned.unvisited_region}
         # The maxima of a distance with kinks lie on ridges, which deeper searches climb higher.
-        if is_kinked(learned.study.given.distance) or (evidence.dense and jumps(replace(evidence, jump=jump), bound)):
-            values, points = learned.deeper
+        if is_kinked(learned.study.given.distance) or (
+            evidence.low_dimensional and jumps(replace(evidence, jump=jump), bound)
+        ):
+            values, points = learned.intensified_search
             low, high = values.min(), values.max()
             further["disagreement"] = float(1 - low / high) if high > 0 else 0.0
             if high > evidence.highest:
-                elites = np.concatenate([points[values.argmax()][None], evidence.elites])
-                further |= {"missed": float(high / evidence.highest), "highest": float(high), "elites": elites}
+                local_maxima = np.concatenate([points[values.argmax()][None], evidence.local_maxima])
+                further |= {
+                    "search_shortfall": float(high / evidence.highest),
+                    "highest": float(high),
+                    "local_maxima": local_maxima,
+                }
         if learned.noisy is None:  # a push is compared with residuals of state and input, which do not hold with noise
             further["pushed"] = learned.push_response
         return replace(evidence, **further)
@@ -261,9 +267,9 @@ class CampaignDynamics:
             noise=noise,
             predictions=tuple(predictions),
             coverage=learned.coverage,
-            untried=learned.untried_parameter,
-            corner=untried_corner(learned.executed, self.study.validation.space, learned.coverage.task),
-            dense=worst.points.shape[1] <= DENSE and self.study.planner.batched,
+            unsampled_parameter=learned.unsampled_parameter,
+            unsampled_corner=unsampled_corner(learned.executed, self.study.validation.space, learned.coverage.task),
+            low_dimensional=worst.points.shape[1] <= DENSE and self.study.planner.batched,
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
             actuator=None if actuator is None else (actuator.delay, actuator.lag),

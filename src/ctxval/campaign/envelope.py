@@ -180,8 +180,8 @@ class EnvelopeSearch:
         missing = diagnostics.missing_tests(evidence.predictions, evidence.tests)
         if missing and self._left <= missing:
             return interval.test()
-        if evidence.untried is not None and diagnostics.untried_parameter(evidence) is not None:
-            return Choice.tested(evidence.untried.task)
+        if evidence.unsampled_parameter is not None and diagnostics.unsampled_parameter(evidence) is not None:
+            return Choice.tested(evidence.unsampled_parameter.task)
         pool, is_suite = learned.study.search.pool, recorder.validation.space.members is not None
         drawn = self._at(learned, pool if is_suite else pool[:_SCREENED], settled=False)
         below, leaving = drawn.mean <= self._threshold, drawn.uncovered(diagnostics.most_beyond(evidence))

@@ -17,8 +17,8 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
-from ctxval.campaign.next_task import NewTasks, next_task
-from ctxval.campaign.proposals import Steadiness, spread_tests
+from ctxval.campaign.next_task import CandidateFilter, next_task
+from ctxval.campaign.proposals import DesignContinuity, spread_tests
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule, Verdict
 from ctxval.certificates.anytime import AnytimeAudit
@@ -42,7 +42,7 @@ from ctxval.certificates.dynamics_diagnostics import (
 )
 from ctxval.certificates.explained import CONTRADICTED, LEVERAGE, evidence_against, least_explained
 from ctxval.certificates.options import WITHIN
-from ctxval.certificates.posterior import Posterior
+from ctxval.certificates.posterior import DistanceBound
 from ctxval.certificates.prediction_tests import DRAWN, HYPERCUBE, MANY, TESTS, hypercube_in
 from ctxval.certificates.sample import SAME
 from ctxval.certificates.verdict import counterexample, require_suite
@@ -190,7 +190,7 @@ class IntervalSearch:
             return Choice.tested(worst.unit_point)
         if not is_noisy:
             return None
-        tasks = [worst.unit_point, learned.worst_of_mean.elites[0]]
+        tasks = [worst.unit_point, learned.worst_of_mean.local_maxima[0]]
         noises = [None if (predicted := learned.predict(task)) is None else predicted.noise for task in tasks]
         chances = [0.0 if noise is None else noise.chance_of_more(self.limit) for noise in noises]
         likeliest = int(np.argmax(chances))
@@ -237,7 +237,7 @@ class IntervalSearch:
         """Return the task that the posterior bound of the distance needs; None if it decides."""
         kind = self.options.kind
         # No distance is known, all are 0, or each task of a suite is executed.
-        if not isinstance(kind, Automatic | Posterior) or not self.limit > 0 or self._suite is not None:
+        if not isinstance(kind, Automatic | DistanceBound) or not self.limit > 0 or self._suite is not None:
             return Choice(planned_draws=0)
         rule = StoppingRule(self.limit, self.options.confidence, kind.resolution)
         now = rule.decide(self.recorder.trials, self.budget - self.recorder.trials.executions)
@@ -253,9 +253,9 @@ class IntervalSearch:
         # The whole evidence may decide if nothing that a few draws show leaves the verdict open.
         bound, enough = self._bound(evidence), len(trials.ended) >= FEWEST
         decides = enough and raised(evidence, bound) <= self.limit and doubt_of(evidence, self.best, bound) is None
-        if decides and evidence.pocket is None and dynamics.kept_evidence(trials, confidence) is None:
+        if decides and evidence.unvisited_region is None and dynamics.kept_evidence(trials, confidence) is None:
             learned = dynamics.learned(trials)
-            evidence = evidence if learned is None else replace(evidence, pocket=learned.pocket)
+            evidence = evidence if learned is None else replace(evidence, unvisited_region=learned.unvisited_region)
         if decides and unentered_pocket(evidence) is None:
             whole = dynamics.evidence(trials, confidence, keep=self.keeps)
             if whole is None:
@@ -297,14 +297,14 @@ class IntervalSearch:
         """Return the task that the learned dynamics choose."""
         best, limit, trials = self.best, self.limit, self.recorder.trials
         learned = self.recorder.dynamics.learned(trials)
-        steady = Steadiness(self.recorder.dynamics.study.planner, None if learned is None else learned.expected)
+        steady = DesignContinuity(self.recorder.dynamics.study.planner, None if learned is None else learned.expected)
         # Failed ones count twice: without a reason, they are not repeated, although a start may jump next to them.
         failed = trials.in_state("failed")
         known, waiting = self._points([*trials.ended, *failed]), self._points(trials.open)
-        new = NewTasks(self._near, steady)
+        new = CandidateFilter(self._near, steady)
         # Tasks that differ in parameters that change no prediction are one task, with values that are spread.
         if learned is not None and self._suite is None:
-            new = NewTasks(self._near, steady, learned.spread_unseen, learned.study.seen_parameters)
+            new = CandidateFilter(self._near, steady, learned.spread_unseen, learned.study.seen_parameters)
         point = next_task(evidence, known, best, limit, self.options.confidence, new)
         if len(waiting) and (point is None or np.abs(waiting - point)[:, new.seen].max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.
@@ -364,7 +364,7 @@ class IntervalSearch:
 
 def is_decisive(options: CertificateOptions) -> bool:
     """Return whether executions can be chosen for a certificate."""
-    return isinstance(options.kind, Automatic | Dynamics | Posterior | AnytimeAudit | WholeSuite)
+    return isinstance(options.kind, Automatic | Dynamics | DistanceBound | AnytimeAudit | WholeSuite)
 
 
 def require_decisive(options: CertificateOptions) -> None:

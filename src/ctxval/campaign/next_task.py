@@ -13,16 +13,16 @@ from ctxval.certificates import DynamicsEvidence
 from ctxval.certificates.dynamics_diagnostics import (
     uncovered,
     unentered_pocket,
+    unsampled_corner,
+    unsampled_parameter,
     untested,
-    untried_corner,
-    untried_parameter,
 )
 
 _NEARS = 0.7  # share of the way from the largest executed distance to the limit from which a draw is near it
 
 
 @dataclass(frozen=True, eq=False)
-class NewTasks:
+class CandidateFilter:
     """Tells which tasks may be executed beside known ones."""
 
     near: float = NEAR  #: the largest change of each coordinate to a task that is no new one
@@ -49,7 +49,7 @@ class NewTasks:
 
 
 def next_task(
-    evidence: DynamicsEvidence, known: Array, best: float, limit: float, confidence: float, new: NewTasks
+    evidence: DynamicsEvidence, known: Array, best: float, limit: float, confidence: float, new: CandidateFilter
 ) -> Array | None:
     """Return the task to execute next, a point ``(d,)``; None if all tasks lie next to executed ones.
 
@@ -68,7 +68,7 @@ def next_task(
     if evidence.friction:  # one execution at the least friction at rest that nears the limit rules out all larger ones
         first = int(np.searchsorted(evidence.maxima[order], best + _NEARS * (limit - best), side="right"))
         highest = evidence.points[[*order[first:], *order[:first][::-1]]]
-    farthest, largest = evidence.coverage.task[None], evidence.elites
+    farthest, largest = evidence.coverage.task[None], evidence.local_maxima
     exceeds = evidence.upper(confidence) > limit
     # Every third execution leads farthest from the records in any case, but friction is known where they are dense.
     if exceeds and len(known) % 3 == 2 and (not evidence.friction or uncovered(evidence)):
@@ -79,13 +79,13 @@ def next_task(
         candidates = [highest, farthest]
     elif uncovered(evidence):
         candidates = [farthest, highest, largest]
-        if evidence.untried is not None and untried_parameter(evidence) is not None:
-            candidates = [evidence.untried.task[None], *candidates]
-        elif evidence.corner is not None and untried_corner(evidence) is not None:
-            candidates = [evidence.corner.task[None], *candidates]
-        elif evidence.pocket is not None and unentered_pocket(evidence) is not None:
-            candidates = [np.array(evidence.pocket.tasks), *candidates]
-    elif evidence.missed > 1 or untested(evidence, best, limit):
+        if evidence.unsampled_parameter is not None and unsampled_parameter(evidence) is not None:
+            candidates = [evidence.unsampled_parameter.task[None], *candidates]
+        elif evidence.unsampled_corner is not None and unsampled_corner(evidence) is not None:
+            candidates = [evidence.unsampled_corner.task[None], *candidates]
+        elif evidence.unvisited_region is not None and unentered_pocket(evidence) is not None:
+            candidates = [np.array(evidence.unvisited_region.tasks), *candidates]
+    elif evidence.search_shortfall > 1 or untested(evidence, best, limit):
         candidates = [largest, highest, farthest]
     else:
         candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]

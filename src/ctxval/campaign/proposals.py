@@ -41,7 +41,7 @@ _DRAW, _HYPERCUBE = 0x6175, 0x6879  # those of independent draws, and of Latin h
 
 
 @dataclass(frozen=True, eq=False)
-class Steadiness:
+class DesignContinuity:
     """Tells for one choice which tasks may be executed, and counts the others."""
 
     planner: LoopPlanner  #: designs controllers; S is never executed
@@ -94,7 +94,7 @@ class Steadiness:
         """Return states ``(m, (H + 1) n)`` of M pushed by 1 % of their ranges a step, as shares of these; else NaN."""
         model, pushed = self.planner.validation.model, list[tuple[Rows, Array]]()
         for planned in self.planner.plan(points):
-            ranges = np.ptp(planned.promised.states.reshape(-1, planned.promised.states.shape[-1]), axis=0)
+            ranges = np.ptp(planned.nominal.states.reshape(-1, planned.nominal.states.shape[-1]), axis=0)
             ranges = np.maximum(ranges, 1e-3 * ranges.max())
 
             run = run_of(model, planned.task.initial_state)
@@ -118,13 +118,13 @@ class Proposals:
 
     def next(self, trials: Sequence[Trial], rejected: int = 0) -> tuple[Array, Note]:
         """Return the search's next point ``(d,)``, tested and rounded unless an earlier trial has it, and its note."""
-        search, steady = self._search, Steadiness(self._dynamics.study.planner)
+        search, steady = self._search, DesignContinuity(self._dynamics.study.planner)
         with stage("choosing a task", unit="designs") if search.uses_prediction else nullcontext():
             if search.uses_prediction:
                 prediction = self._dynamics.prediction(trials, pending=True)
                 if prediction is not None:
                     expected = prediction.expected
-                    steady = Steadiness(self._dynamics.study.planner, lambda points: expected(points)[0])
+                    steady = DesignContinuity(self._dynamics.study.planner, lambda points: expected(points)[0])
                     costs = partial(costs_of, prediction, self._validation, trials)
                     left = remaining_tasks(self._validation, trials)
                     prediction = replace(prediction, costs=costs, steady=steady, candidates=left)
@@ -163,7 +163,7 @@ class Proposals:
         assert choice.unit_point is not None
         if choice.parameters is not None or choice.origin == "iid":
             return choice.unit_point, choice.note
-        steady = Steadiness(self._dynamics.study.planner) if choice.rejected is None else None
+        steady = DesignContinuity(self._dynamics.study.planner) if choice.rejected is None else None
         return self._final(choice.unit_point, trials, steady, choice.note, choice.rejected or 0)
 
     def _asked(self) -> tuple[Array, Note]:
@@ -185,7 +185,7 @@ class Proposals:
         raise InputError(f"the note of a search must be a dictionary of plain values for JSON, got {note!r}.")
 
     def _final(
-        self, point: Array, trials: Sequence[Trial], steady: Steadiness | None, note: Note, rejected: int
+        self, point: Array, trials: Sequence[Trial], steady: DesignContinuity | None, note: Note, rejected: int
     ) -> tuple[Array, Note]:
         """Return a steady task (if tested), rounded or left of a suite; its note counts the rejected ones."""
         remaining = remaining_tasks(self._validation, trials)

@@ -138,9 +138,9 @@ class TrialRecorder:
 
     def _redefine(self, validation: Validation, description: dict[str, Any]) -> None:
         self.validation, self.description, self._parts_tried = validation, description, False
-        elsewhere = self.dynamics.elsewhere
+        elsewhere = self.dynamics.extra_recordings
         self.dynamics = CampaignDynamics(validation, self.store, self._seed, description)
-        self.dynamics.elsewhere = elsewhere
+        self.dynamics.extra_recordings = elsewhere
         self._proposals = Proposals(validation, self.search, self.dynamics)
         self.replay()
 

@@ -11,13 +11,13 @@ from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.options import CertificateOptions
-from ctxval.certificates.posterior import Diagnosis, Posterior, diagnose, instantaneous_bound
+from ctxval.certificates.posterior import Diagnosis, DistanceBound, diagnose, instantaneous_bound
 from ctxval.certificates.provenance import Neighbour, Provenance
-from ctxval.certificates.sample import PLANNED, MadeGood, Sample, require_learned
+from ctxval.certificates.sample import PLANNED, RecoveredFailure, Sample, require_learned
 from ctxval.certificates.scenario import Audit, Region, SamplingDiscarding, Scenario, samples_needed, tail, volume_bound
 from ctxval.certificates.stopping import StoppingDecision, StoppingRule
 from ctxval.certificates.verdict import Assessment, Verdict, assess, judge, judge_by
-from ctxval.core.coverage import StateInputCoverage, StateInputGap, UntriedCorner, UntriedParameter
+from ctxval.core.coverage import StateInputCoverage, StateInputGap, UnsampledCorner, UnsampledParameter
 
 __all__ = [
     "KINDS",
@@ -32,15 +32,15 @@ __all__ = [
     "CertificateOptions",
     "CheckedPrediction",
     "Diagnosis",
+    "DistanceBound",
     "Dynamics",
     "DynamicsEvidence",
     "Forecast",
     "LearnedDistance",
-    "MadeGood",
     "Maxima",
     "Neighbour",
-    "Posterior",
     "Provenance",
+    "RecoveredFailure",
     "Region",
     "Sample",
     "SamplingDiscarding",
@@ -49,8 +49,8 @@ __all__ = [
     "StateInputGap",
     "StoppingDecision",
     "StoppingRule",
-    "UntriedCorner",
-    "UntriedParameter",
+    "UnsampledCorner",
+    "UnsampledParameter",
     "Verdict",
     "WatchState",
     "WholeSuite",

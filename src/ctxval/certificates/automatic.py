@@ -15,7 +15,7 @@ from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION, covering, farthest_task
 from ctxval.certificates.dynamics import Dynamics
 from ctxval.certificates.dynamics_diagnostics import FEWEST, mostly_fail
-from ctxval.certificates.posterior import Posterior
+from ctxval.certificates.posterior import DistanceBound
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences.statements import EXECUTED_AGAIN
@@ -97,7 +97,7 @@ class Automatic(CertificateKind):
             if preferred and farthest_task(sample.points) > self.resolution:
                 return by_dynamics  # the posterior bound, which takes seconds, would be withdrawn
         try:
-            certificate = Posterior(self.resolution).certify(sample, confidence)
+            certificate = DistanceBound(self.resolution).certify(sample, confidence)
         except CertificateError:
             if by_dynamics is None:
                 raise

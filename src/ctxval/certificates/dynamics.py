@@ -39,7 +39,7 @@ from ctxval.errors import CertificateError
 # Attributes of the evidence that are numbers of the certificate as well.
 _COPIED = (
     *("noise", "quantile", "lags", "actuator", "physical", "suspect", "without_model", "without_data", "estimated"),
-    *("friction", "sharpness", "jump", "missed", "disagreement", "negligible"),
+    *("friction", "peak_ratio", "jump", "search_shortfall", "disagreement", "negligible"),
 )
 MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
 
@@ -171,7 +171,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
         **{name: list(value) if isinstance(value, tuple) else value for name, value in copied.items()},
         "share_supported": share_supported(evidence.executions, above, confidence) if is_noisy else None,
         "variance_left_out": evidence.left_out,
-        "pocket": evidence.pocket and asdict(evidence.pocket),
+        "unvisited_region": evidence.unvisited_region and asdict(evidence.unvisited_region),
         "empty_box": None if empty is None else asdict(empty),
         "pushed": evidence.pushed and evidence.pushed.to_json(),
         "differing": None if differing is None else [sample.numbers[row] for row in differing],
@@ -182,6 +182,6 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
 def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> float:
     """Return the order statistic of the maxima, raised by what searches and predictions have missed."""
     excess = max((prediction.excess for prediction in evidence.predictions[-diagnostics.PREDICTIONS :]), default=0.0)
-    upper = evidence.upper(confidence) * evidence.missed
+    upper = evidence.upper(confidence) * evidence.search_shortfall
     # A noisy execution may exceed the quantile that is bounded.
     return (max(upper, best) if evidence.quantile is None else upper) + 0.5 * excess

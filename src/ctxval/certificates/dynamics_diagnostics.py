@@ -168,7 +168,7 @@ def raised(evidence: DynamicsEvidence, bound: float) -> float:
 
 def jumps(evidence: DynamicsEvidence, bound: float) -> bool:
     """Return whether the distance is no smooth function of the task, so that a search may miss the largest one."""
-    return evidence.sharpness > SHARP or evidence.jump > JUMP * bound
+    return evidence.peak_ratio > SHARP or evidence.jump > JUMP * bound
 
 
 # Which executions would help
@@ -221,12 +221,12 @@ def doubts(evidence: DynamicsEvidence, best: float, bound: float) -> Iterator[st
     if (missing := tests_missing(evidence)) is not None:
         yield missing
     yield from unexplained(evidence, bound)
-    if not evidence.dense and jumps(evidence, bound):
+    if not evidence.low_dimensional and jumps(evidence, bound):
         what = sentences.JUMP.format(percent=100 * evidence.jump / bound)
-        if evidence.sharpness > SHARP:
-            what = sentences.NEEDLE.format(percent=100 * evidence.sharpness)
+        if evidence.peak_ratio > SHARP:
+            what = sentences.NEEDLE.format(percent=100 * evidence.peak_ratio)
         yield sentences.JUMPS.format(what=what)
-    share = max(evidence.missed - 1, evidence.disagreement)
+    share = max(evidence.search_shortfall - 1, evidence.disagreement)
     if share > AGREE:
         yield sentences.SEARCHES_DIFFER.format(percent=100 * share)
 
@@ -301,7 +301,7 @@ def uncovered(evidence: DynamicsEvidence) -> list[str]:
         missing.append(sentences.GAP.format(gap=at(coverage.marginal)))
     if pair is not None and pair.size > PAIR_GAP:
         missing.append(sentences.PAIR_GAP.format(gap=at(pair)))
-    others = untried_parameter(evidence), untried_corner(evidence), unentered_pocket(evidence)
+    others = unsampled_parameter(evidence), unsampled_corner(evidence), unentered_pocket(evidence)
     return [*missing, *filter(None, others)]
 
 
@@ -310,17 +310,17 @@ def most_beyond(evidence: DynamicsEvidence) -> float:
     return GAP if evidence.coverage.pair is None else BEYOND if evidence.quantile is None else NOISY_BEYOND
 
 
-def untried_parameter(evidence: DynamicsEvidence) -> str | None:
+def unsampled_parameter(evidence: DynamicsEvidence) -> str | None:
     """Return that values of a parameter which the loops of M do not depend on were not tried; None if they were."""
-    untried = evidence.untried
+    untried = evidence.unsampled_parameter
     if untried is None or untried.gap <= GAP:
         return None
     return sentences.UNTRIED.format(name=untried.name, percent=100 * untried.gap)
 
 
-def untried_corner(evidence: DynamicsEvidence) -> str | None:
+def unsampled_corner(evidence: DynamicsEvidence) -> str | None:
     """Return that a corner of a position in space was not tried; None if all were."""
-    corner = evidence.corner
+    corner = evidence.unsampled_corner
     if corner is None or corner.gap <= CORNER:
         return None
     return sentences.UNTRIED_CORNER.format(place=with_units(corner.place))
@@ -328,7 +328,7 @@ def untried_corner(evidence: DynamicsEvidence) -> str | None:
 
 def unentered_pocket(evidence: DynamicsEvidence) -> str | None:
     """Return that no execution has entered a place in space that predicted runs enter; None if it is small."""
-    pocket = evidence.pocket
+    pocket = evidence.unvisited_region
     if pocket is None or not pocket.tasks or pocket.size <= POCKET:
         return None
     return sentences.POCKET.format(within=radius_of(pocket.within), place=with_units(pocket.place))

@@ -14,7 +14,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import rank_of
 from ctxval.certificates.explained import ExplainedExecution
 from ctxval.certificates.prediction_tests import MANY, TESTS
-from ctxval.core.coverage import StateInputCoverage, StateInputGap, StatePocket, UntriedCorner, UntriedParameter
+from ctxval.core.coverage import StateInputCoverage, StateInputGap, UnsampledCorner, UnsampledParameter, UnvisitedRegion
 from ctxval.core.learned_numbers import PushedDistances
 from ctxval.core.quantiles import LEVELS, QUANTILE, chance_of_more
 from ctxval.core.trial import Origin
@@ -75,7 +75,7 @@ class DynamicsEvidence(ShortRepr):
     maxima: Array  #: the largest distance over all tasks of each draw, shape ``(S,)``; infinity if its loop diverges
     points: Array  #: where it lies, points of the unit cube ``(S, d)``
     highest: float  #: the largest distance on the posterior mean, and below it those of other tasks
-    elites: Array  #: tasks with large distances on the posterior mean, points ``(e, d)``, the largest first
+    local_maxima: Array  #: tasks with large distances on the posterior mean, points ``(e, d)``, the largest first
     evaluations: int  #: number of closed loops on learned dynamics that were run to find the maxima
     executions: int  #: number of executions with a trajectory, from which the dynamics were learned
     left_out: float  #: share of the posterior variance that a draw leaves out between its pivots
@@ -84,13 +84,13 @@ class DynamicsEvidence(ShortRepr):
     coverage: StateInputCoverage  #: how well the records cover the closed loops of the tasks
     groups: int = 2  #: number of draws that share hyperparameters
     unplanned: float = 0.0  #: share of the tasks for which no controller can be designed, or on which M diverges
-    untried: UntriedParameter | None = None  #: a parameter that M's loops do not depend on; None if there is none
-    corner: UntriedCorner | None = None  #: the corner of a position farthest from executed tasks; None without any
+    unsampled_parameter: UnsampledParameter | None = None  #: a parameter that M's loops do not depend on
+    unsampled_corner: UnsampledCorner | None = None  #: the corner of a position farthest from executed tasks
     without_model: bool = False  #: whether the system was learned without M, because M is rougher than the system
-    sharpness: float = 0.0  #: largest share by which a large distance on the mean exceeds those of nearly same tasks
+    peak_ratio: float = 0.0  #: largest share by which a large distance on the mean exceeds those of nearly same tasks
     jump: float = 0.0  #: largest jump of the distance on the mean between nearly the same tasks; 0 if not computed
-    dense: bool = False  #: whether task parameters are so few that deeper searches can find what lies between jumps
-    missed: float = 1.0  #: factor by which the largest distance on the mean is larger in deeper searches; at least 1
+    low_dimensional: bool = False  #: whether an intensified search can find maxima in spite of jumps
+    search_shortfall: float = 1.0  #: factor by which intensified searches find a larger maximum; at least 1
     disagreement: float = 0.0  #: share by which the smaller result of these searches is below the larger one
     tests: int = TESTS  #: the number of tests that a bound needs; see :mod:`~ctxval.certificates.prediction_tests`
     pushed: PushedDistances | None = None  #: largest distances under pushes; None if the bound is withdrawn anyway
@@ -100,7 +100,7 @@ class DynamicsEvidence(ShortRepr):
     #: the dry friction at each input, by its label, the most at rest if that is more, and its share of the input if it
     #: grows with it; empty if what M misses is smooth
     friction: Mapping[str, float] = field(default_factory=dict)
-    pocket: StatePocket | None = None  #: the largest region that no execution has entered; None if it is not known
+    unvisited_region: UnvisitedRegion | None = None  #: the largest region that no execution has entered
     physical: tuple[str, ...] = ()  #: the task parameters that the learned dynamics depend on
     #: another one that they seem to depend on, and how many times less predictions of executions from the others err
     #: with it; None if predictions hold, or if there is none
@@ -136,7 +136,7 @@ class DynamicsEvidence(ShortRepr):
 
         Only executions can tell what such a parameter changes, and one hypercube misses most boxes of two parameters.
         """
-        idle = self.untried is not None and self.untried.idle
+        idle = self.unsampled_parameter is not None and self.unsampled_parameter.idle
         return replace(self, tests=2 * tests if idle and tests < MANY else tests)
 
     def to_json(self) -> dict[str, Any]:
@@ -148,7 +148,9 @@ class DynamicsEvidence(ShortRepr):
     def from_json(cls, values: Any) -> Self | None:
         """Return the evidence that :meth:`to_json` returned; None if these are not its values."""
         try:
-            coverage, untried, corner, pocket = (values[name] for name in ("coverage", "untried", "corner", "pocket"))
+            coverage, untried, corner, pocket = (
+                values[name] for name in ("coverage", "unsampled_parameter", "unsampled_corner", "unvisited_region")
+            )
             tuples = ("point", "quantiles", "p_values")
             gaps = {
                 name: gap and StateInputGap(**{**gap, "coordinates": tuple(gap["coordinates"])})
@@ -156,17 +158,18 @@ class DynamicsEvidence(ShortRepr):
                 if name in ("marginal", "beyond", "pair")
             }
             parts = {
-                **{name: np.array(values[name], dtype=np.float64) for name in ("maxima", "points", "elites")},
+                **{name: np.array(values[name], dtype=np.float64) for name in ("maxima", "points", "local_maxima")},
                 **{name: values[name] and tuple(values[name]) for name in ("actuator", "suspect")},
                 "predictions": tuple(
                     CheckedPrediction(**{**each, **{name: tuple(each[name]) for name in tuples}})
                     for each in values["predictions"]
                 ),
                 "coverage": StateInputCoverage(**{**coverage, **gaps, "task": np.array(coverage["task"])}),
-                "untried": untried and UntriedParameter(**{**untried, "task": np.array(untried["task"])}),
-                "corner": corner and UntriedCorner(**{**corner, "task": np.array(corner["task"])}),
+                "unsampled_parameter": untried and UnsampledParameter(**{**untried, "task": np.array(untried["task"])}),
+                "unsampled_corner": corner and UnsampledCorner(**{**corner, "task": np.array(corner["task"])}),
                 "pushed": values["pushed"] and PushedDistances.from_json(values["pushed"]),
-                "pocket": pocket and StatePocket(**{**pocket, "tasks": tuple(map(tuple, pocket["tasks"]))}),
+                "unvisited_region": pocket
+                and UnvisitedRegion(**{**pocket, "tasks": tuple(map(tuple, pocket["tasks"]))}),
                 "physical": tuple(values["physical"]),
                 "executed": tuple(
                     ExplainedExecution(

@@ -48,7 +48,7 @@ from ctxval.certificates.dynamics_diagnostics import (
     most_beyond,
     tested,
     unlearned,
-    untried_parameter,
+    unsampled_parameter,
 )
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
 from ctxval.certificates.envelope_shape import (
@@ -188,7 +188,7 @@ def withdrawn(space: TaskSpace, threshold: float, confidence: float, doubt: str)
 def doubt_of_envelope(evidence: DynamicsEvidence, threshold: float) -> str | None:
     """Return why no envelope can be stated, and what would help; None if one can."""
     # Tasks that cannot be planned are no part of the envelope.
-    for doubt in (*unlearned(replace(evidence, unplanned=0.0), threshold), untried_parameter(evidence)):
+    for doubt in (*unlearned(replace(evidence, unplanned=0.0), threshold), unsampled_parameter(evidence)):
         if doubt is not None:
             return doubt
     for test in evidence.predictions:

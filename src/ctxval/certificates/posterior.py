@@ -36,7 +36,7 @@ from ctxval.gp.surrogate import fit_surrogate
 
 @part("posterior")
 @dataclass(frozen=True, repr=False)
-class Posterior(CertificateKind):
+class DistanceBound(CertificateKind):
     """Bound on d* from the posterior of a Gaussian process of the distance.
 
     If two executions of one task differ, the bound is one on the largest expected distance.

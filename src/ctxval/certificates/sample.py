@@ -24,7 +24,7 @@ PLANNED = "draws"
 
 
 @dataclass(frozen=True)
-class MadeGood(ShortRepr):
+class RecoveredFailure(ShortRepr):
     """A failed trial whose task was executed with success later."""
 
     trial: int  #: number of the trial that failed
@@ -44,7 +44,7 @@ class Sample(ShortRepr):
     #: for each trial, the total number of independent draws that was planned when it was drawn; 0 if they were to end
     #: with the verdict, None if that is not known
     planned: Sequence[int | None] = ()
-    made_good: tuple[MadeGood, ...] = ()  #: left-out failures whose tasks were executed later
+    made_good: tuple[RecoveredFailure, ...] = ()  #: left-out failures whose tasks were executed later
     learned: LearnedDistance | None = None  #: what the experiment's model predicts; None if it is not loaded
     distribution: str | None = None  #: the distribution of tasks as a text; None if it is uniform
     suite: Array | None = None  #: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box
@@ -78,13 +78,13 @@ class Sample(ShortRepr):
         """
         if not trials:
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
-        made_good = list[MadeGood]()
+        made_good = list[RecoveredFailure]()
         for trial in trials:
             if trial.state == "failed" and trial.ended_alone is None and trial.origin != "iid":
                 later = [success for success in executions_of(trial, trials) if success.number > trial.number]
                 by = next((success for success in later if success.because), later[0] if later else None)
                 if by is not None:
-                    made_good.append(MadeGood(trial.number, by.number, by.because))
+                    made_good.append(RecoveredFailure(trial.number, by.number, by.because))
         # A distance that was told alone under another definition does not matter if the task was executed again.
         alone = [trial for trial in trials if trial.failure == TOLD_ALONE and trial.origin != "iid"]
         left_out = {failure.trial for failure in made_good} | {t.number for t in alone if executions_of(t, trials)}

@@ -19,7 +19,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.certificates.covering import RESOLUTION, covering, most_contested
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.options import CONFIDENCE, Confidence
-from ctxval.certificates.posterior import Posterior, instantaneous_bound
+from ctxval.certificates.posterior import DistanceBound, instantaneous_bound
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.verdict import counterexample
 from ctxval.core.trial import Trial, Trials
@@ -89,7 +89,7 @@ class StoppingRule(ShortRepr):
     def _is_kept(self, sample: Sample) -> tuple[Maxima, bool]:
         drawn = settle_maxima(sample, self.threshold, self.confidence)
         # Coverage is left aside: its resolution is the whole task space.
-        certificate = Posterior(resolution=1.0).certify_drawn(sample, drawn, self.confidence)
+        certificate = DistanceBound(resolution=1.0).certify_drawn(sample, drawn, self.confidence)
         return drawn, certificate.covers(self.threshold)
 
     def _is_surely_too_high(self, sample: Sample) -> bool:

@@ -33,7 +33,7 @@ class StateInputCoverage(ShortRepr):
 
 
 @dataclass(frozen=True)
-class StatePocket:
+class UnvisitedRegion:
     """The largest region of two states that closed loops of tasks enter, and that no execution has entered."""
 
     size: float  #: its radius, as a share of the visited ranges
@@ -45,7 +45,7 @@ class StatePocket:
 
 
 @dataclass(frozen=True, eq=False)
-class UntriedCorner(ShortRepr):
+class UnsampledCorner(ShortRepr):
     """The corner of two components of a position in space that is farthest from all executed tasks."""
 
     place: dict[str, float]  #: the two components by their labels
@@ -54,7 +54,7 @@ class UntriedCorner(ShortRepr):
 
 
 @dataclass(frozen=True, eq=False)
-class UntriedParameter(ShortRepr):
+class UnsampledParameter(ShortRepr):
     """A task parameter that hardly changes the closed loops of M."""
 
     name: str  #: its name

@@ -19,7 +19,7 @@ from ctxval._util.boxes import separated_rows
 from ctxval.gp.ascent import Evaluations, Values
 
 _SAMPLED, _EVOLVED, _CLIMBED = 0.35, 0.7, 0.88  # shares of the evaluations after which these parts end
-_REACHES = (0.3, 0.1)  # least distance of good parents at first and at last, and of elites, in diagonals
+_REACHES = (0.3, 0.1)  # least distance of good parents at first and at last, and of local maxima, in diagonals
 _STEPS = (0.3, 0.005)  # largest standard deviation of a mutation in the first and in the last generation
 
 
@@ -29,7 +29,7 @@ class GlobalMaximum:
 
     points: Array  # all points that were evaluated, those of largest values first (m, d)
     values: Array  # their values (m,); minus infinity if the function was not finite there
-    elites: Array  # good points that are apart from each other, the best first (e, d); none if no value is finite
+    local_maxima: Array  # good points that are apart from each other, the best first (e, d); none if no value is finite
 
 
 def search_globally(

@@ -28,7 +28,6 @@ T = TypeVar("T")
 AnyPosterior = DynamicsPosterior | NoisyPosterior  # of dynamics without and with noise
 
 _UNITS = "closed loops", "designs", "tasks"  # of stages that closed loops are progress of
-_REMEMBERED = 64_000_000  # largest size of the plans that are kept, in bytes, approximately
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +37,7 @@ class PlannedTasks:
     rows: Rows  # the rows of these tasks among all points that were planned, (q,)
     task: Task
     controller: Controller
-    promised: Trajectory
+    nominal: Trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +52,12 @@ class Loops:
 class LoopPlanner:
     """Designs controllers for points of the unit cube, and runs drawn systems in closed loop with them.
 
-    The latest plans are kept. Tasks that are planned together are kept together, because a controller of a batch need
-    not have parts; they are found again if the same points are asked for in the same order.
+    The latest plans are kept, up to about ``kept_bytes``. Tasks that are planned together are kept together, because a
+    controller of a batch need not have parts; they are found again if the same points are asked for in the same order.
     """
 
-    def __init__(self, validation: Validation) -> None:
-        self.validation = validation
+    def __init__(self, validation: Validation, kept_bytes: int = 64_000_000) -> None:
+        self.validation, self.kept_bytes = validation, kept_bytes
         self._together: bool | None = None
         self._kept: OrderedDict[bytes, tuple[list[PlannedTasks], int]] = OrderedDict()
         self._size = 0
@@ -88,11 +87,11 @@ class LoopPlanner:
             else:
                 planned = self._planned(some)
                 # Trajectories, and gains as large as those of a linear feedback.
-                arrays = [(plan.promised.states, plan.promised.inputs) for plan in planned]
+                arrays = [(plan.nominal.states, plan.nominal.inputs) for plan in planned]
                 needed = sum(2 * (x.nbytes + u.nbytes) + int(x.shape[-1]) * u.nbytes for x, u in arrays) + len(key)
                 self._kept[key] = planned, needed
                 self._size += needed
-                while self._size > _REMEMBERED:
+                while self._size > self.kept_bytes:
                     self._size -= self._kept.popitem(last=False)[1][1]
             advance(len(some), units=_UNITS)  # as if those that are kept were planned again
             plans += [replace(plan, rows=first + plan.rows) for plan in planned]
@@ -118,10 +117,10 @@ class LoopPlanner:
         parts = self.validation
         task = parts.task_at(parts.space.parameters(parts.space.from_unit(chosen)))
         controller = parts.synthesizer.design(task, parts.model)
-        promised = parts.closed_loop(controller, task)
-        if promised.batch_shape != chosen.shape[:-1]:
+        nominal = parts.closed_loop(controller, task)
+        if nominal.batch_shape != chosen.shape[:-1]:
             raise ValueError("the task function did not return one task for each point")
-        return PlannedTasks(rows, task, controller, promised)
+        return PlannedTasks(rows, task, controller, nominal)
 
     def run(self, draws: Draws, planned: Sequence[PlannedTasks]) -> list[Loops]:
         """Return the closed loops of all draws on the same tasks."""
@@ -180,11 +179,11 @@ class LoopPlanner:
 
     def compared(self, planned: PlannedTasks, loops: Trajectory) -> Array:
         """Return the distances ``(q,)`` of loops; infinity if one ends alone or is not measured, NaN if M diverges."""
-        task, promised, between = planned.task, planned.promised, self.validation.distance_between
-        model, system, known = promised, loops, promised.finite & loops.finite
-        if (both := promised.predicts & ~promised.finite & loops.predicts & ~loops.finite).any():  # they ended early
-            common, known = np.minimum(promised.lengths, loops.lengths), known | both
-            model, system = (run.held(common, task.times) for run in (promised, loops))
+        task, nominal, between = planned.task, planned.nominal, self.validation.distance_between
+        model, system, known = nominal, loops, nominal.finite & loops.finite
+        if (both := nominal.predicts & ~nominal.finite & loops.predicts & ~loops.finite).any():  # they ended early
+            common, known = np.minimum(nominal.lengths, loops.lengths), known | both
+            model, system = (run.held(common, task.times) for run in (nominal, loops))
         if not known.all():  # a distance need not take what is not finite
             kept = known[..., None, None]
             model, system = (
@@ -201,7 +200,7 @@ class LoopPlanner:
                     alone = between(model[k], system[k], task[k])
                     values[k] = alone if not alone.shape else np.inf
         distances = np.where(known & np.isfinite(values), values, np.inf)
-        return np.where(promised.predicts, distances, np.nan).reshape(len(planned.rows))
+        return np.where(nominal.predicts, distances, np.nan).reshape(len(planned.rows))
 
 
 def _probed(controller: Controller, task: Task, steps: int) -> Array:
@@ -254,9 +253,9 @@ def unseen_parameters(planner: LoopPlanner, some: Array) -> tuple[int, ...]:
     ends = moves_to_bounds(some, np.zeros(d), np.ones(d)).reshape(-1, d)
     loops: dict[int, Array] = {}
     for plan in planner.plan(ends):
-        promised = np.concatenate([plan.promised.states[..., :-1, :], plan.promised.inputs], axis=-1)
-        promised[~np.isfinite(promised)] = np.nan  # M diverges
-        loops.update(zip(plan.rows.tolist(), promised.reshape(len(plan.rows), *promised.shape[-2:]), strict=True))
+        nominal = np.concatenate([plan.nominal.states[..., :-1, :], plan.nominal.inputs], axis=-1)
+        nominal[~np.isfinite(nominal)] = np.nan  # M diverges
+        loops.update(zip(plan.rows.tolist(), nominal.reshape(len(plan.rows), *nominal.shape[-2:]), strict=True))
     if not loops:
         return ()
     size = np.maximum(np.nanstd(np.concatenate(list(loops.values())), axis=0), 1e-12)

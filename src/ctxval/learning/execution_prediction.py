@@ -155,7 +155,7 @@ def predict_execution(
     (run,) = planner.run(draws, planned)
     horizon = run.inputs.shape[2]
     steps = np.unique(np.linspace(1, horizon, min(horizon, 16)).astype(int))
-    loops = recorded(Trajectory(planned[0].promised.times, run.states[:, 0], run.inputs[:, 0])).states
+    loops = recorded(Trajectory(planned[0].nominal.times, run.states[:, 0], run.inputs[:, 0])).states
     states, distances = loops[:, steps], run.distances[:, 0]
     size = max(float(np.nanmedian(np.abs(states))), 1e-9)
     with np.errstate(all="ignore"):  # what is far beyond the states of all other draws has diverged

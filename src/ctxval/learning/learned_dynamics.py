@@ -13,7 +13,7 @@ from scipy.spatial.distance import cdist
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import parted
-from ctxval.core.coverage import StateInputCoverage, StatePocket, UntriedParameter
+from ctxval.core.coverage import StateInputCoverage, UnsampledParameter, UnvisitedRegion
 from ctxval.core.labels import labels_of
 from ctxval.core.learned_numbers import PushedDistances
 from ctxval.core.model import Model, predicted_steps, with_memory
@@ -97,7 +97,7 @@ class LearnedDynamics(ShortRepr):
             for point in points:
                 for plan in planner.plan(point[None]):
                     (loops,) = planner.run(self.posterior.mean, [plan])
-                    executed = Trajectory(plan.promised.times, loops.states[0, 0], loops.inputs[0, 0])
+                    executed = Trajectory(plan.nominal.times, loops.states[0, 0], loops.inputs[0, 0])
                     if executed.finite:
                         tasks.append((point, executed))
         return tasks
@@ -192,15 +192,15 @@ class LearnedDynamics(ShortRepr):
         return self._worst_cases[functions]
 
     @functools.cached_property
-    def deeper(self) -> tuple[Array, Array]:
+    def intensified_search(self) -> tuple[Array, Array]:
         """The largest distances on the posterior mean ``(2,)`` in two deeper searches, and their points ``(2, d)``."""
-        return self.study.search.deeper(self.drawn_from, self._rng(3))
+        return self.study.search.intensified_search(self.drawn_from, self._rng(3))
 
     @functools.cached_property
     def push_response(self) -> PushedDistances:
         """The largest distances over large, executed and random tasks if something pushes the posterior mean."""
         search = self.study.search
-        tasks = [self.worst_of_mean.elites[:16], self.executed, search.pool[:16]]
+        tasks = [self.worst_of_mean.local_maxima[:16], self.executed, search.pool[:16]]
         return push_response(self.study.planner, self.posterior, np.concatenate(tasks), self.labels)
 
     @functools.cached_property
@@ -243,7 +243,7 @@ class LearnedDynamics(ShortRepr):
         return position_states(space, labels, search.plans, search.pool, goals=goals) if space.members is None else []
 
     @functools.cached_property
-    def pocket(self) -> StatePocket | None:
+    def unvisited_region(self) -> UnvisitedRegion | None:
         """The largest region of two states that loops enter and no execution has entered."""
         planner, states, pool = self.study.planner, len(self.posterior.data.sizes), self.study.search.pool[:256]
         with single_threaded():
@@ -258,7 +258,7 @@ class LearnedDynamics(ShortRepr):
         return largest_pocket(visited[finite], executed, labels, self.positions, rows[finite], pool)
 
     @property
-    def untried_parameter(self) -> UntriedParameter | None:
+    def unsampled_parameter(self) -> UnsampledParameter | None:
         """The parameter without effect on M's loops whose gap is largest; None if there is none."""
         space, executed = self.study.validation.space, self.executed
         gaps = [
@@ -270,7 +270,7 @@ class LearnedDynamics(ShortRepr):
         j, gap, value = max(gaps, key=lambda each: each[1])
         task = self.coverage.task.copy()
         task[j] = value
-        return UntriedParameter(space.names[j], gap, task, self.has_idle)
+        return UnsampledParameter(space.names[j], gap, task, self.has_idle)
 
     @functools.cached_property
     def has_idle(self) -> bool:

@@ -72,8 +72,8 @@ class AgreeingDynamics(LearnedDynamics):
     @functools.cached_property
     def _pool_loops(self) -> list[Loops]:
         """The closed loops of M on the pool's tasks, which are planned already."""
-        promised = [(plan.promised.states, plan.promised.inputs) for plan in self.study.search.plans]
-        loops = [[part.reshape(1, -1, *part.shape[-2:]) for part in parts] for parts in promised]
+        nominal = [(plan.nominal.states, plan.nominal.inputs) for plan in self.study.search.plans]
+        loops = [[part.reshape(1, -1, *part.shape[-2:]) for part in parts] for parts in nominal]
         return [Loops(np.zeros(states.shape[:2]), states, inputs) for states, inputs in loops]
 
     @functools.cached_property
@@ -91,7 +91,7 @@ class AgreeingDynamics(LearnedDynamics):
     def _distance_of(self, point: Array, trajectory: Trajectory) -> float:
         """Return the distance of an execution; 0 if it is not known."""
         for plan in self.study.planner.plan(point[None]):
-            model = plan.promised
+            model = plan.nominal
             if model.states.size == trajectory.states.size:
                 shapes = model.states.shape, model.inputs.shape
                 states, inputs = (
@@ -104,10 +104,10 @@ class AgreeingDynamics(LearnedDynamics):
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance under negligible errors, for each of so many draws."""
         points, distances = self._under_errors
-        order = np.argsort(-distances, kind="stable")[: self.study.search.settings.elites]
+        order = np.argsort(-distances, kind="stable")[: self.study.search.settings.local_maxima]
         maxima = np.full(self.posterior.functions_for(draws), self.negligible)
         plans = self.study.search.plans
-        unplanned = 1 - sum(int(np.sum(plan.promised.finite)) for plan in plans) / len(self.study.search.pool)
+        unplanned = 1 - sum(int(np.sum(plan.nominal.finite)) for plan in plans) / len(self.study.search.pool)
         at = np.repeat(points[order[:1]], len(maxima), axis=0)
         return WorstCase(maxima, at, self.negligible, points[order], _WAYS * len(points), 0.0, unplanned)
 

@@ -119,12 +119,12 @@ class ErrorVectors:
                 if self._planner.batched:
                     plan = validation.plan(validation.space.from_unit(point))
                     advance()
-                    task, promised = plan.task, plan.model_trajectory
+                    task, nominal = plan.task, plan.model_trajectory
                 else:
                     (planned,) = self._planner.plan(point[None])
-                    task, promised = planned.task, planned.promised
+                    task, nominal = planned.task, planned.nominal
                 # Some distances change the arrays that they are given.
-                self._known[trajectory] = distance.error(promised.copy(), trajectory.copy(), task)
+                self._known[trajectory] = distance.error(nominal.copy(), trajectory.copy(), task)
             errors = np.array([self._known[trajectory] for _, trajectory in executed])
         except Exception:  # the user's own parts: a distance may reject even tasks that were executed
             return None

@@ -62,9 +62,9 @@ def _replayed(study: DynamicsStudy, model: DynamicsDraws | None, point: Array) -
     if model is None:
         return nothing
     try:
-        promised = validation.closed_loop(controller, task)
+        nominal = validation.closed_loop(controller, task)
         predicted = rollout(model, controller, task)
-        distance = float(validation.distance_between(promised, predicted, task))
+        distance = float(validation.distance_between(nominal, predicted, task))
     except Exception:  # the same
         return nothing
     finite = bool(predicted.finite.all()) and np.isfinite(distance)

@@ -1,10 +1,10 @@
 """The largest distance over all tasks, for each draw of the dynamics.
 
 First the distance on the posterior mean is searched, from a pool of tasks whose controllers are designed once for a
-whole campaign. Its elites, the tasks with known distances and some random tasks are then run on draws. For a screening
-that is all, with few draws. Otherwise each draw is searched on its own around the best of these: coordinates are moved
-to bounds, one at a time and all that help together, and points are moved at random by ever smaller steps. Between these
-rounds each draw tries the best tasks of the others.
+whole campaign. Its local maxima, the tasks with known distances and some random tasks are then run on draws. For a
+screening that is all, with few draws. Otherwise each draw is searched on its own around the best of these: coordinates
+are moved to bounds, one at a time and all that help together, and points are moved at random by ever smaller steps.
+Between these rounds each draw tries the best tasks of the others.
 """
 
 from __future__ import annotations
@@ -24,13 +24,6 @@ from ctxval.learning.draws import Draws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
 _DIVERGED = 1e30  # the distance of a loop that diverges, in searches: larger than all others, and finite
-_EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)  # tasks of a global search, for 1, 2, ... parameters
-_SHOWN = 16  # largest number of these tasks
-_NEARBY = 1e-3  # largest change of each coordinate to a task that is nearly the same
-_NEARER = 64  # how many times nearer tasks are that tell kinks of a distance from jumps, a power of 2
-_SCREENED = (8, 1500)  # number of draws of the hyperparameters in a screening, and of tasks in its search on the mean
-_FURTHER = 256  # number of random tasks beside these if draws differ in the dry friction at rest
-_APART = 0.15  # least distance of two tasks that are not next to each other, as a share of the cube's diagonal
 
 
 @dataclass(frozen=True)
@@ -39,21 +32,30 @@ class WorstCaseSettings:
 
     pool: int = 1024  # number of tasks whose controllers are designed once
     evaluations: int = 6000  # number of tasks in the global search on the mean, with those of the pool
-    elites: int = 24  # largest number of tasks from the global search that are run on all draws
+    local_maxima: int = 24  # largest number of tasks from the global search that are run on all draws
     shared: int = 64  # number of random tasks of the pool that are run on all draws
     moves: int = 10  # number of random moves in each round of the search on each draw
     rounds: int = 4  # number of these rounds, at most 4
-    # number of state-input pairs, on the loops of elites and of random tasks, from which pivots are chosen
+    # number of state-input pairs, on the loops of local maxima and of random tasks, from which pivots are chosen
     relevant: int = 700
-    peaks: int = 5  # number of elites next to which tasks are tried
+    peaks: int = 5  # number of local maxima next to which tasks are tried
     nearby: int = 32  # number of tasks next to each of them
+    near: float = 1e-3  # largest change of each coordinate to a task that is nearly the same
+    nearer: int = 64  # how many times nearer tasks are that tell kinks of a distance from jumps, a power of 2
+    apart: float = (
+        0.15  # least distance of two tasks that are not next to each other, as a share of the cube's diagonal
+    )
+    shown: int = 16  # largest number of the best tasks of all draws that each draw tries
+    screened_draws: int = 8  # number of draws of the hyperparameters in a screening
+    screened_tasks: int = 1500  # number of tasks in its search on the mean
+    further: int = 256  # number of random tasks in a screening if draws differ in the dry friction at rest
 
     @classmethod
     def for_dimension(cls, dimension: int, batched: bool = True) -> WorstCaseSettings:
         """Return settings for so many task parameters; there are far fewer tasks if they are designed one by one."""
         if not batched:
-            return cls(pool=64, evaluations=256, elites=6, shared=12, moves=2, rounds=0, peaks=1, nearby=8)
-        evaluations = _EVALUATIONS[min(dimension, len(_EVALUATIONS)) - 1]
+            return cls(pool=64, evaluations=256, local_maxima=6, shared=12, moves=2, rounds=0, peaks=1, nearby=8)
+        evaluations = (512, 2048, 4096, 6000, 6000, 6000, 12000)[min(dimension, 7) - 1]  # for 1, 2, ... parameters
         return cls(pool=min(1024, evaluations // 4), evaluations=evaluations)
 
 
@@ -64,12 +66,12 @@ class WorstCase:
     maxima: Array  # the largest distance of each draw, (S,); infinity if its closed loop diverges
     points: Array  # where it lies, points of the unit cube (S, d)
     highest: float  # the largest distance on the posterior mean
-    elites: Array  # tasks with large distances on the posterior mean, points (e, d), the largest first
+    local_maxima: Array  # tasks with large distances on the posterior mean, points (e, d), the largest first
     evaluations: int  # number of closed loops that were compared; a few of them may be the same
     left_out: float  # largest share of the posterior variance that a draw leaves out between its pivots
     unplanned: float  # share of the pool's tasks for which no controller can be designed, or on which M diverges
     # largest share by which a distance on the mean is larger than those of tasks that are nearly the same
-    sharpness: float = 0.0
+    peak_ratio: float = 0.0
 
     def with_draws(self, maxima: Array, points: Array, loops: int, left_out: float) -> WorstCase:
         """Return what a search has found on the mean and then, in so many more loops, on draws."""
@@ -90,7 +92,8 @@ class WorstCaseSearch:
 
     def expected_loops(self, draws: int) -> int:
         """Return about how many closed loops a search with so many draws runs, on M and on the draws."""
-        settings, all_draws = self.settings, self.settings.elites + self.settings.shared + _SHOWN
+        settings = self.settings
+        all_draws = settings.local_maxima + settings.shared + settings.shown
         moves = settings.rounds * (2 * self.dimension + settings.moves + 1)
         return 2 * settings.evaluations + all_draws + draws * (all_draws + 2 * moves)
 
@@ -98,8 +101,9 @@ class WorstCaseSearch:
     def screening_loops(self) -> int:
         """About how many closed loops a screening runs."""
         settings = self.settings
-        shared = settings.elites + settings.shared // 4
-        return 2 * settings.pool + min(_SCREENED[1], settings.evaluations) + (1 + _SCREENED[0]) * shared
+        shared = settings.local_maxima + settings.shared // 4
+        screened = min(settings.screened_tasks, settings.evaluations)
+        return 2 * settings.pool + screened + (1 + settings.screened_draws) * shared
 
     @functools.cached_property
     def pool(self) -> Array:
@@ -121,7 +125,8 @@ class WorstCaseSearch:
     @functools.cached_property
     def _in_rows(self) -> tuple[Array, list[PlannedTasks]]:
         """Three nearly equal tasks in a row from each task of the pool, points ``(N, 3, d)``, and their plans."""
-        moves = np.random.default_rng([self._seed, 1]).uniform(-_NEARBY, _NEARBY, self.pool.shape)
+        near = self.settings.near
+        moves = np.random.default_rng([self._seed, 1]).uniform(-near, near, self.pool.shape)
         outside = (self.pool + 2 * moves < 0) | (self.pool + 2 * moves > 1)
         tasks = self.pool[:, None] + np.arange(3)[:, None] * np.where(outside, -moves, moves)[:, None]
         return tasks, self.planner.plan(tasks.reshape(-1, self.dimension))
@@ -144,11 +149,11 @@ class WorstCaseSearch:
         return float(jumps[np.isfinite(jumps)].max(initial=0.0))
 
     def _nearer(self, posterior: AnyPosterior, tasks: Array, distances: Array) -> Array:
-        """Return distances ``(k, 3)`` of tasks in a row that are ``_NEARER`` times nearer, where they bend most."""
+        """Return distances ``(k, 3)`` of tasks in a row that are much nearer, where they bend most."""
         bends = np.abs(distances[:, 1] - 0.5 * (distances[:, 0] + distances[:, 2]))
         rows = np.argsort(-np.nan_to_num(bends, nan=0.0, posinf=0.0), kind="stable")[:64]
         tasks, distances = tasks[rows], distances[rows]
-        for _ in range(int(np.log2(_NEARER))):  # of each row, the half with the larger change is kept: a jump is in it
+        for _ in range(int(np.log2(self.settings.nearer))):  # a jump is in the half of a row with the larger change
             later = np.abs(distances[:, 2] - distances[:, 1]) > np.abs(distances[:, 1] - distances[:, 0])
             ends = np.where(later[:, None], [1, 2], [0, 1])
             tasks, distances = np.take_along_axis(tasks, ends[..., None], 1), np.take_along_axis(distances, ends, 1)
@@ -158,7 +163,7 @@ class WorstCaseSearch:
             distances = np.stack([distances[:, 0], value, distances[:, 1]], axis=1)
         return distances
 
-    def deeper(self, posterior: AnyPosterior, rng: np.random.Generator) -> tuple[Array, Array]:
+    def intensified_search(self, posterior: AnyPosterior, rng: np.random.Generator) -> tuple[Array, Array]:
         """Return the largest distances on the mean ``(2,)``, and where, in two searches of four times as many tasks."""
         distance, none = self._on_one(posterior.mean), np.empty((0, self.dimension))
         evaluations = 4 * self.settings.evaluations
@@ -177,44 +182,48 @@ class WorstCaseSearch:
         if self.members is not None:
             left, values = self._left(known), _finite(of_pool)
             order = [row for row in np.argsort(-values, kind="stable") if left[row]] or [int(values.argmax())]
-            elites = self.members[order[: self.settings.elites]]
-            return self._of_mean(posterior, float(values[order[0]]), elites, len(values))
+            local_maxima = self.members[order[: self.settings.local_maxima]]
+            return self._of_mean(posterior, float(values[order[0]]), local_maxima, len(values))
         settings, distance = self.settings, self._on_one(posterior.mean.searched)
-        best = self.pool[np.argsort(-_finite(of_pool), kind="stable")[: settings.elites * 4]]
+        best = self.pool[np.argsort(-_finite(of_pool), kind="stable")[: settings.local_maxima * 4]]
         starts = np.concatenate([known, best])
         with single_threaded():
             if not globally and not is_kinked(self.planner.validation.distance):
-                budget = min(_SCREENED[1], settings.evaluations)
+                budget = min(settings.screened_tasks, settings.evaluations)
                 same = posterior.rough_mean is posterior.mean.searched
                 rough = None if same else self._on_one(posterior.rough_mean)
                 box = np.zeros(self.dimension), np.ones(self.dimension)
-                points, values = ascend(distance, box, budget, starts[: len(known) + _SHOWN], rng, rough)
-                apart = separated_rows(points, _APART * np.sqrt(self.dimension), settings.elites)
+                points, values = ascend(distance, box, budget, starts[: len(known) + settings.shown], rng, rough)
+                apart = separated_rows(points, settings.apart * np.sqrt(self.dimension), settings.local_maxima)
                 return self._of_mean(posterior, float(values[0]), points[apart], len(points))
             evaluations = max(len(starts) + 50, settings.evaluations - len(self.pool))
             maximum = search_globally(distance, self.dimension, starts, rng, evaluations=evaluations)
-        elites = np.concatenate([maximum.points[:1], maximum.elites[: settings.elites]])
-        return self._of_mean(posterior, float(maximum.values[0]), elites, len(maximum.values))
+        local_maxima = np.concatenate([maximum.points[:1], maximum.local_maxima[: settings.local_maxima]])
+        return self._of_mean(posterior, float(maximum.values[0]), local_maxima, len(maximum.values))
 
-    def _of_mean(self, posterior: AnyPosterior, highest: float, elites: Array, evaluations: int) -> WorstCase:
+    def _of_mean(self, posterior: AnyPosterior, highest: float, local_maxima: Array, evaluations: int) -> WorstCase:
         if posterior.mean.searched is not posterior.mean:
             with single_threaded():
-                values = self._distances(posterior.mean, elites)[0]
+                values = self._distances(posterior.mean, local_maxima)[0]
             order = np.argsort(-values, kind="stable")
-            highest, elites, evaluations = float(values[order[0]]), elites[order], evaluations + len(elites)
-        unplanned = 1 - sum(int(np.sum(plan.promised.predicts)) for plan in self.plans) / len(self.pool)
+            highest, local_maxima, evaluations = (
+                float(values[order[0]]),
+                local_maxima[order],
+                evaluations + len(local_maxima),
+            )
+        unplanned = 1 - sum(int(np.sum(plan.nominal.predicts)) for plan in self.plans) / len(self.pool)
         loops = len(self.pool) + evaluations
-        return WorstCase(np.array([highest]), elites[:1], highest, elites, loops, 0.0, unplanned)
+        return WorstCase(np.array([highest]), local_maxima[:1], highest, local_maxima, loops, 0.0, unplanned)
 
     def screened(
         self, posterior: AnyPosterior, of_mean: WorstCase, known: Array, rng: np.random.Generator
     ) -> WorstCase:
-        """Return the largest distances of a few draws over the elites, known tasks and random ones: a lower bound."""
+        """Return the largest distances of a few draws over local maxima, known and random tasks: a lower bound."""
         with single_threaded():
             tasks = self._shared_tasks(of_mean, known, self.settings.shared // 4, rng)
-            draws = posterior.draw(self.relevant(posterior, tasks, rng), rng, 1, _SCREENED[0])
+            draws = posterior.draw(self.relevant(posterior, tasks, rng), rng, 1, self.settings.screened_draws)
             if _sticks(posterior) and self.members is None:  # their largest distances lie far from those of the mean
-                further = self.pool[rng.permutation(len(self.pool))[:_FURTHER]]
+                further = self.pool[rng.permutation(len(self.pool))[: self.settings.further]]
                 points, maxima, loops = self._search_draws(draws, np.concatenate([tasks, further]), rng)
                 return of_mean.with_draws(maxima, points, loops, draws.left_out)
             values = self._distances(draws, tasks)
@@ -236,25 +245,26 @@ class WorstCaseSearch:
             # controllers jump from task to task, the largest distance is a needle that a search finds by chance. Kinks
             # are no needles: they are flat between tasks that are nearer. Nor is a task at which a joint is just held,
             # like those on one side of it.
-            peaks = of_mean.elites[: 0 if self.members is not None else self.settings.peaks]
-            near = _NEARBY / _NEARER if is_kinked(self.planner.validation.distance) else _NEARBY
-            moves = rng.uniform(-near, near, (len(peaks), self.settings.nearby, self.dimension))
+            peaks = of_mean.local_maxima[: 0 if self.members is not None else self.settings.peaks]
+            settings = self.settings
+            near = settings.near / settings.nearer if is_kinked(self.planner.validation.distance) else settings.near
+            moves = rng.uniform(-near, near, (len(peaks), settings.nearby, self.dimension))
             beside = np.concatenate([peaks[:, None], np.clip(peaks[:, None] + moves, 0, 1)], axis=1)
             flat = self._distances(posterior.mean, beside.reshape(-1, self.dimension))[0]
             distances = np.maximum(flat.reshape(beside.shape[:2]), 0.0)
             peak = distances[:, 0]
             next_to_it = np.quantile(distances[:, 1:], 0.9 if _sticks(posterior) else 0.5, axis=1)
             lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
-        sharpness = float(max(lost.max(initial=0.0), 0.0))
-        return replace(of_mean.with_draws(maxima, points, loops, draws.left_out), sharpness=sharpness)
+        peak_ratio = float(max(lost.max(initial=0.0), 0.0))
+        return replace(of_mean.with_draws(maxima, points, loops, draws.left_out), peak_ratio=peak_ratio)
 
     def _shared_tasks(self, of_mean: WorstCase, known: Array, count: int, rng: np.random.Generator) -> Array:
-        """Return the tasks that draws share: elites, known tasks and random ones; of a suite, those not known."""
+        """Return the tasks that draws share: local maxima, known tasks and random ones; of a suite, those not known."""
         if self.members is not None:
             left = self.members[self._left(known)]
-            return left if len(left) else of_mean.elites
+            return left if len(left) else of_mean.local_maxima
         random = self.pool[rng.permutation(len(self.pool))[:count]]
-        return np.concatenate([of_mean.elites, known, random])
+        return np.concatenate([of_mean.local_maxima, known, random])
 
     def _left(self, known: Array) -> Mask:
         """Return which tasks of a suite are not among points ``(k, d)``: the distance of the others is known."""
@@ -279,7 +289,7 @@ class WorstCaseSearch:
         best, points = np.take_along_axis(values, order[:, :1], 1)[:, 0], tasks[order[:, 0]]
         # The best task of each draw that is not next to its best one; the second best if all are.
         ordered = tasks[order]
-        apart = np.linalg.norm(ordered - ordered[:, :1], axis=2) > _APART * np.sqrt(self.dimension)
+        apart = np.linalg.norm(ordered - ordered[:, :1], axis=2) > self.settings.apart * np.sqrt(self.dimension)
         rows = np.where(apart.any(axis=1), apart.argmax(axis=1), min(1, len(tasks) - 1))
         second, searched = ordered[np.arange(len(ordered)), rows], np.arange(len(draws))
         for round_, share in enumerate((0.1, 0.05, 0.02, 0.007)[: self.settings.rounds]):
@@ -287,7 +297,7 @@ class WorstCaseSearch:
             if round_ == 2:
                 # Each draw tries the best tasks of all others.
                 best_first = points[np.argsort(-best, kind="stable")]
-                shown = best_first[separated_rows(best_first, 0.02 * np.sqrt(self.dimension), _SHOWN)]
+                shown = best_first[separated_rows(best_first, 0.02 * np.sqrt(self.dimension), self.settings.shown)]
                 distances = self._distances(draws, shown)
                 points, best = _better(points, best, np.broadcast_to(shown, (len(best), *shown.shape)), distances)
                 loops += distances.size

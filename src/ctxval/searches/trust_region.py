@@ -212,15 +212,15 @@ class TrustRegion(SequentialSearch):
         box = np.clip(centre - region.radius, 0, 1), np.clip(centre + region.radius, 0, 1)
         if few is not None:
             points = few[((few >= box[0]) & (few <= box[1])).all(axis=1)]
-            promised = value(points) if len(points) else np.empty(0)
-            order = np.argsort(-np.nan_to_num(promised, nan=-np.inf), kind="stable")
-            points, promised = points[order], promised[order]
+            predicted = value(points) if len(points) else np.empty(0)
+            order = np.argsort(-np.nan_to_num(predicted, nan=-np.inf), kind="stable")
+            points, predicted = points[order], predicted[order]
         else:
             budget = min(prediction.budget, POINTS * self.dimension)
             rough = None if prediction.rough is None else functools.partial(optimistic, prediction.rough)
             starts = best_first(history.points, history.values)[:8]
-            points, promised = ascend(value, box, budget, starts, rng, rough)
-        points = points[self._is_new(points, history) & np.isfinite(promised)]
+            points, predicted = ascend(value, box, budget, starts, rng, rough)
+        points = points[self._is_new(points, history) & np.isfinite(predicted)]
         if not len(points):
             return None
         point = next(filter(prediction.steady or (lambda point: True), points), points[0])

@@ -19,7 +19,7 @@ from ctxval._util.progress import advance, stage
 from ctxval._util.texts import text_of
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.goals_of_model import GoalWarning
-from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.certificates.scenario import volume_bound
 from ctxval.certificates.verdict import Verdict
@@ -180,7 +180,7 @@ def _report(campaign: Campaign, distance: Distance, threshold: float | None, see
     validation, share, verdict = campaign.validation, None, None
     if threshold is not None:
         if campaign.completed:
-            verdict = campaign.verdict(threshold, certificate=CertificateOptions(Posterior()))
+            verdict = campaign.verdict(threshold, certificate=CertificateOptions(DistanceBound()))
         drawn = [trial for trial in campaign.trials if trial.origin == "iid"]
         missed = sum(trial.distance is None or trial.distance > threshold for trial in drawn)
         # The upper bound of Clopper and Pearson (1934).

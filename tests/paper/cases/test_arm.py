@@ -178,9 +178,9 @@ def test_aspects_are_the_distances_to_the_targets(aspects: dict[str, arm.Aspects
     )
     found = aspects["gp"]
     np.testing.assert_allclose(to_goal.distances(found.targets), found.system_error, rtol=0, atol=1e-9)
-    promised = np.array([whole.plan(target).model_trajectory.final_state[4:] for target in found.targets[:5]])
+    nominal = np.array([whole.plan(target).model_trajectory.final_state[4:] for target in found.targets[:5]])
     np.testing.assert_allclose(
-        np.linalg.norm(promised - found.targets[:5], axis=1), found.model_error[:5], rtol=0, atol=1e-9
+        np.linalg.norm(nominal - found.targets[:5], axis=1), found.model_error[:5], rtol=0, atol=1e-9
     )
     # By the triangle inequality the distance of the campaign is within the sum of the two.
     assert (whole.distances(found.targets) <= found.model_error + found.system_error + 1e-12).all()

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from ctxval import Campaign, TaskSpace, Trajectory, Validation, cases, models, refine, searches, systems
-from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.paper.cases import pendulum
 from ctxval.studies.fitting import FittedParameter
 from ctxval.studies.refinement import ParameterFit, Records
 from rig_thorough import more
 
-CHEAP = CertificateOptions(Posterior())
+CHEAP = CertificateOptions(DistanceBound())
 """The certificate by which tasks are chosen; it costs less than the dynamics bound."""
 
 

@@ -219,7 +219,7 @@ def _evidence(certificate: Certificate, tau: float, quantities: Quantities) -> s
             f"{_push(everywhere)} at every step, or of {_push(away)} where no record is near; the largest error of M"
             f"{beside} in the records, which was learned, is {_rate(everywhere.state, everywhere.residual)}."
         )
-    if (pocket := details.get("pocket")) is not None:
+    if (pocket := details.get("unvisited_region")) is not None:
         text += (
             f" The least tested place is {with_units(pocket['place'])}: predicted runs lead there, and no execution "
             f"came within {radius_of(pocket['within'])}."

@@ -156,10 +156,10 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
     trials = sorted(executed_trials(campaign.store, campaign.trials), key=lambda pair: -(pair[0].distance or 0.0))
     failed = list[tuple[Trial, Trajectory]]()
     for trial in campaign.failed if validation.outputs is None else ():
-        promised, run = campaign.trajectories(trial)
-        if promised is not None and run is not None and len(failed) < _FAILED:
+        nominal, run = campaign.trajectories(trial)
+        if nominal is not None and run is not None and len(failed) < _FAILED:
             # What was recorded until the system left the surroundings of what M promised.
-            far = np.abs(run.states - promised.states[0]) > _AWAY * np.ptp(promised.states, axis=0).clip(1e-12)
+            far = np.abs(run.states - nominal.states[0]) > _AWAY * np.ptp(nominal.states, axis=0).clip(1e-12)
             steps = min([run.horizon, *(np.flatnonzero(far.any(axis=1))[:1] - 1)])
             if steps >= _STEPS:
                 failed.append((trial, run.first(steps)))

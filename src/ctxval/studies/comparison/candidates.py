@@ -160,7 +160,7 @@ class Executions:
 
     def __post_init__(self) -> None:
         for candidate in self.candidates:
-            candidate.recorder.dynamics.elsewhere = partial(self._elsewhere, candidate)
+            candidate.recorder.dynamics.extra_recordings = partial(self._elsewhere, candidate)
             for _, note in candidate.noted:
                 self.decided |= {(decision.smaller, decision.larger): decision for decision in note.decided}
 

@@ -65,7 +65,7 @@ def predicted_tasks(validation: Validation, runs: list[Trajectory], count: int, 
     with single_threaded():
         worst, pool = learned.worst_case_of(1), study.search.pool
         random = pool[np.random.default_rng([seed, 3]).permutation(len(pool))[:96]]
-        together = np.concatenate([worst.elites[:24], worst.points, random])
+        together = np.concatenate([worst.local_maxima[:24], worst.points, random])
         points = np.unique(together.round(6), axis=0)[:: max(1, -(-len(together) // 384))]
         rng, planner = np.random.default_rng([seed, 4]), study.planner
         pairs = loop_pairs(planner, learned.posterior, points)

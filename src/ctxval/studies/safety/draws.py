@@ -56,8 +56,8 @@ def on_model(planner: LoopPlanner, spec: Specification, unit: Array) -> Array:
     with single_threaded():
         for loops in planner.plan(unit):
             with np.errstate(all="ignore"):
-                of_tasks = spec.robustness(loops.promised, loops.task)
-            rho[loops.rows] = np.where(loops.promised.finite, of_tasks, -np.inf)
+                of_tasks = spec.robustness(loops.nominal, loops.task)
+            rho[loops.rows] = np.where(loops.nominal.finite, of_tasks, -np.inf)
     return rho
 
 
