@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from ctxval.certificates import Forecast, Maxima, Sample, draw_maxima, forecast
+from ctxval.learning.actuators import ActuatorSettings
 from ctxval.learning.dynamics_posterior import PosteriorSettings
+from ctxval.learning.dynamics_study import LearningSettings
 from ctxval.learning.hyperparameters import FAMILIES
 from ctxval.learning.worst_case import WorstCaseSettings
 from ctxval.searches.trust_region import FAST
@@ -50,5 +53,5 @@ def run_few_loops(replace: Callable[[str, Any], None]) -> None:
     replace("ctxval.learning.dynamics_posterior.PosteriorSettings.for_horizon", lambda *_: draws)
     replace("ctxval.searches.trust_region._SHARES", (FAST,))
     # Delays and lags of inputs are looked for in each campaign whose model errs: half of its time.
-    replace("ctxval.learning.actuators._LEARNED_FROM", 40)
-    replace("ctxval.learning.actuators._TRIED", [(1.0, 0.0), (3.0, 0.0), (0.0, 1.5)])
+    actuators = ActuatorSettings(learned_from=40, tried=((1.0, 0.0), (3.0, 0.0), (0.0, 1.5)))
+    replace("ctxval.learning.dynamics_study.LearningSettings", partial(LearningSettings, actuators=actuators))
