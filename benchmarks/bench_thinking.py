@@ -149,8 +149,16 @@ def measured(threshold: float, budget: int, **parts: Any) -> dict[str, Any]:
         verdict = campaign.verdict(threshold, **options)
     seconds = time.process_time() - begun
     choices = [a + b for a, b in zip(chosen[:before], [*opened, 0.0], strict=False)]
-    return {"answer": verdict.answer, "executions": campaign.executions, "verdict": seconds, "choices": choices,
-            "bound": verdict.bound, "reason": verdict.reason[:300]}
+    return {
+        "answer": verdict.answer,
+        "executions": campaign.executions,
+        "verdict": seconds,
+        "choices": choices,
+        "bound": verdict.bound,
+        "reason": verdict.reason[:300],
+        "notes": [(trial.note or {}).get("thinking") for trial in campaign.trials],
+        "shortage": getattr(verdict, "shortage", None),
+    }
 
 
 if __name__ == "__main__":
@@ -164,5 +172,25 @@ if __name__ == "__main__":
     parser.add_argument("--budget", type=int, default=EXECUTIONS)
     parser.add_argument("--threshold", type=float, default=0.5)
     a = parser.parse_args()
-    found = measured(a.threshold, a.budget, states=a.states, seconds=a.ms / 1000, batched=a.batched, noise=a.noise, hidden=a.hidden, **({} if a.thinking is None else {"thinking": a.thinking}))
-    print([round(x, 2) for x in found["choices"]], round(found["verdict"], 2), found["answer"], found["executions"], found["bound"], found["reason"])
+    found = measured(
+        a.threshold,
+        a.budget,
+        states=a.states,
+        seconds=a.ms / 1000,
+        batched=a.batched,
+        noise=a.noise,
+        hidden=a.hidden,
+        **({} if a.thinking is None else {"thinking": a.thinking}),
+    )
+    print(
+        [round(x, 2) for x in found["choices"]],
+        round(found["verdict"], 2),
+        found["answer"],
+        found["executions"],
+        found["bound"],
+        found["reason"],
+    )
+    print("speed", found["notes"][0] and found["notes"][0]["speed"], found["shortage"])
+    for choice, note in zip(found["choices"], found["notes"], strict=False):
+        if note and "spent" in note:
+            print(round(choice, 2), note["spent"], note["replaced"])

@@ -16,6 +16,7 @@ from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.history import at_points, executed_trials
 from ctxval.campaign.storage.store import Store
+from ctxval.campaign.thinking import THINKING, CampaignThinking, TimeShortage
 from ctxval.certificates.dynamics import bound_of, draws_for
 from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, failed, jumps
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
@@ -29,6 +30,7 @@ from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.coverage import unsampled_corner
 from ctxval.learning.prediction import Executed
+from ctxval.learning.thinking import Ledger
 from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
@@ -36,7 +38,7 @@ from ctxval.searches.base import Pending
 PREDICTION = "prediction"  #: key of the prediction of an execution in the note of its trial
 NEAR = 0.02  #: a task that differs from an executed one by less than this in every coordinate is no new one
 
-_Known = Latest[tuple[object, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None]]
+_Known = Latest[tuple[object, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None, Ledger]]
 
 
 def prediction_in(note: Mapping[str, Any] | None) -> ExecutionPrediction | None:
@@ -64,7 +66,10 @@ class CampaignDynamics:
         self._store = store
         self.extra_recordings: Callable[[], Sequence[Trajectory]] = tuple
         self.failure: str | None = None
+        self.shortage: TimeShortage | None = None  #: why the last verdict has no evidence; None if it has some
         self._use(DynamicsStudy(validation, seed))
+        manual = bool(getattr(validation.system, "manual", False))
+        self.thinking = CampaignThinking(self.study.validation, manual, self.study.settings.thinking)
 
     def _use(self, study: DynamicsStudy) -> None:
         self.study, self._learned = study, _Known(PREDICTIONS + 3)
@@ -85,17 +90,31 @@ class CampaignDynamics:
         # The other recordings are kept with what they taught, so that their identities stay theirs. A result may be
         # replaced, and then has another distance.
         allowed = self._allowed(trials)
-        key = (allowed, *((trial.number, trial.distance) for trial, _ in executed), *map(id, others))
+        results = tuple((trial.number, trial.distance) for trial, _ in executed)
+        key = (self.thinking.after(trials), allowed, *results, *map(id, others))
         if key not in self._learned:
             learned, failure = None, None
+            ledger = self.thinking.ledger(trials, [trajectory for _, trajectory in executed])
             try:
-                self._parts = self._parts or self.study.state_of_parts()
-                learned = self.study.learn(at_points(executed), others, allowed)
+                with ledger.spending("learning"):
+                    if not ledger.spent_up:
+                        self._parts = self._parts or self.study.state_of_parts()
+                        learned = self.study.learn(at_points(executed), others, allowed, ledger)
             except Exception as error:  # users' parts
                 failure = reason_of(error)
-            self._learned[key] = others, learned, failure
-        _, learned, self.failure = self._learned[key]
+            self._learned[key] = others, learned, failure, ledger
+        _, learned, self.failure, self._ledger = self._learned[key]
         return learned
+
+    def ledger(self, trials: Sequence[Trial]) -> Ledger:
+        """Return the budget of the choice after trials, and what its stages took."""
+        self.learned(trials)
+        return self._ledger
+
+    def note(self, trials: Sequence[Trial]) -> dict[str, Any]:
+        """Return what the next trial stores of the thinking on its task; empty without a budget."""
+        note = self.thinking.note(trials, self.ledger(trials) if trials else Ledger())
+        return {} if note is None else {THINKING: note}
 
     def _allowed(self, trials: Sequence[Trial]) -> float:
         """Return the distance that is negligible beside all stated thresholds; 0 if executed ones are larger."""
@@ -142,7 +161,7 @@ class CampaignDynamics:
     def predict(self, trials: Sequence[Trial], point: Array, *, alone: bool = False) -> ExecutionPrediction | None:
         """Return the prediction at a point ``(d,)``, with ``alone`` from trials alone; None if there is none."""
         try:
-            with stage("predicting the execution", unit="closed loops"):
+            with stage("predicting the execution", unit="closed loops"), self.ledger(trials).spending("loops"):
                 learned = self.learned(trials, alone=alone)
                 return None if learned is None else learned.predict(point)
         except Exception:  # users' parts
@@ -154,7 +173,11 @@ class CampaignDynamics:
         It has a few draws, and none but the posterior mean after fewer executions than a bound needs. With ``pending``
         as in :meth:`prediction`, it helps to choose a task and decides nothing.
         """
-        with stage("searching the learned dynamics", self.study.search.screening_loops, "closed loops"):
+        ledger = self.ledger(trials)
+        if ledger.spent_up:
+            return None
+        loops = self.study.search.screening_loops
+        with stage("searching the learned dynamics", loops, "closed loops"), ledger.spending("loops"):
             learned = self.learned(trials)
             few = learned is not None and len(learned.executed) < FEWEST
             if learned is not None and pending:
@@ -171,16 +194,47 @@ class CampaignDynamics:
         kept = self.kept_evidence(trials, confidence)
         if kept is not None:
             return kept
-        digest, draws = self._store.digest(), draws_for(confidence)
-        with stage("searching the learned dynamics", self.study.search.expected_loops(draws), "closed loops"):
-            learned = self.learned(trials)
+        digest, draws, self.shortage = self._store.digest(), draws_for(confidence), None
+        loops = None if self.ledger(trials).spent_up else self.study.search.expected_loops(draws)
+        with stage("searching the learned dynamics", loops, "closed loops"):
             try:
-                evidence = None if learned is None else self._whole(learned, trials, confidence)
+                evidence = self._within_budget(trials, confidence)
             except Exception as error:  # users' parts
                 self.failure, evidence = reason_of(error), None
         if keep and evidence is not None and not self.extra_recordings():
             self._store.keep_computed(self._key(trials, confidence), evidence.to_json(), digest)
         return evidence
+
+    def _within_budget(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
+        """Return the whole evidence; None if nothing can be learned, or if the budget of a verdict does not suffice."""
+        learned, ledger = self.learned(trials), self.ledger(trials)
+        with self.thinking.deciding():
+            budget = self.thinking.after(trials)
+            if budget is None or ledger.costs is None:
+                return None if learned is None else self._whole(learned, trials, confidence, ledger)
+            # The choice of a task may have left out what the longer time of a verdict allows.
+            incomplete = ledger.spent_up or (learned is not None and not learned.is_complete)
+            if incomplete and budget.seconds > ledger.costs.thinking.seconds:
+                learned, ledger = self.learned(trials), self.ledger(trials)
+        if learned is None and not ledger.spent_up:
+            return None
+        by, draws, replicates = self.thinking.search_settings, draws_for(confidence), 1
+        if learned is not None and learned.is_complete:
+            replicates = 1 if learned.noisy is None else learned.noisy.replicates
+            learned = learned.with_whole_search()
+        with ledger.within(budget), ledger.spending("loops"):
+            # Errors of M that are negligible are no function to search.
+            is_cheap = learned is not None and not learned.posterior.data.learned.any()
+            needed = 0.0 if is_cheap else ledger.seconds("loops", lambda costs: costs.whole(by, draws, replicates))
+            if learned is not None and not ledger.incomplete and needed <= ledger.left:
+                ledger.add("loops", needed)
+                evidence = self._whole(learned, trials, confidence, ledger)
+                if not ledger.missing:
+                    return replace(evidence, replaced=tuple(dict.fromkeys(ledger.replaced)))
+                needed = ledger.missing
+            needed += sum(ledger.expected.values()) + ledger.incomplete
+            self.shortage = TimeShortage(needed, budget.seconds, tuple(dict.fromkeys(ledger.replaced)))
+            return None
 
     def kept_evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
         """Return :meth:`evidence` that the store keeps for these trials; None if there is none."""
@@ -195,7 +249,9 @@ class CampaignDynamics:
         physical = "".join(f"{name} " for name in self.study.given.physical)
         return f"evidence {confidence} {self.study.quantile} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
-    def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence:
+    def _whole(
+        self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float, ledger: Ledger
+    ) -> DynamicsEvidence:
         draws, drawn_from = draws_for(confidence), learned.drawn_from
         without_model = learned.posterior.covariances.without_model
         known = {"noise": drawn_from.noise, "groups": drawn_from.functions_for(draws), "without_model": without_model}
@@ -206,7 +262,9 @@ class CampaignDynamics:
         if (influential := learned.influential) is not None:
             further["influential"] = tuple(influential.tolist())
         further |= {"drift": learned.drift, "uneven": learned.uneven_friction}
-        if failed(evidence, bound) is not None:
+        names, stage = len(self.study.given.space.units) + 1, "the parameter that the dynamics seem to depend on"
+        fails = failed(evidence, bound) is not None
+        if fails and ledger.optional("learning", stage, lambda costs: names * costs.learning()):
             further["suspect"] = learned.study.suspected_parameter(learned)
         # How many tests a verdict needs is not known here. Negligible errors are no function to search, nor to push.
         if evidence.negligible or doubt_of(replace(evidence, tests=0, **further), best, bound):
@@ -218,6 +276,9 @@ class CampaignDynamics:
         if is_kinked(learned.study.given.distance) or (
             evidence.low_dimensional and jumps(replace(evidence, jump=jump), bound)
         ):
+            if not ledger.fits("loops", lambda costs: costs.intensified(learned.search.settings)):
+                ledger.missing = ledger.seconds("loops", lambda costs: costs.intensified(learned.search.settings))
+                return replace(evidence, **further)
             values, points = learned.intensified_search
             low, high = values.min(), values.max()
             further["disagreement"] = float(1 - low / high) if high > 0 else 0.0
@@ -228,7 +289,10 @@ class CampaignDynamics:
                     "highest": float(high),
                     "local_maxima": local_maxima,
                 }
-        if learned.noisy is None:  # a push is compared with residuals of state and input, which do not hold with noise
+        # A push is compared with residuals of state and input, which do not hold with noise.
+        if learned.noisy is None and ledger.optional(
+            "loops", "pushes that the bound survives", lambda costs: costs.pushes(learned.search.settings)
+        ):
             further["pushed"] = learned.push_response
         return replace(evidence, **further)
 
@@ -292,6 +356,11 @@ class CampaignDynamics:
                 recent = place >= len(completed) - PREDICTIONS - 1
                 if not recent or self.learned(before, alone=True) is None:
                     continue
+                stage = "predictions of executions afterwards"
+                if not self.ledger(trials).optional(
+                    "learning", stage, lambda costs: costs.learning() + costs.prediction(40)
+                ):
+                    continue
                 key = tuple((each.number, each.distance) for each in completed[: place + 1])
                 if key not in self._afterwards:
                     self._afterwards[key] = self.predict(before, trial.unit_point, alone=True)
@@ -342,6 +411,8 @@ class LearnedFromTrials:
         """Return what the dynamics learned from all trials say about d*; None if nothing can be learned."""
         self.study.use_quantile(quantile)
         evidence = self.study.evidence(self.trials, confidence)
+        if evidence is None and self.study.shortage is not None:
+            raise CertificateError(f"{self.study.shortage}.")
         if evidence is None and self.study.failure is not None:
             raise CertificateError(f"no dynamics can be learned: {self.study.failure.rstrip('.')}.")
         return evidence

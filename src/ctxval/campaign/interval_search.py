@@ -121,6 +121,7 @@ class IntervalSearch:
         trials = self.recorder.trials
         if not self.recorder.has_tasks:
             return None
+        self.recorder.dynamics.thinking.measure(trials)
         if self.threshold is not None and any(trial.least > self.threshold for trial in trials):
             repeated = self._against_noise()
             if repeated is not None or self.is_falsified:
@@ -215,7 +216,7 @@ class IntervalSearch:
             return None
         worst = trials.worst.unit_point
         known, learned = self._points(trials), self.recorder.dynamics.learned(trials)
-        unseen = [] if learned is None else learned.study.unseen_parameters
+        unseen = () if learned is None else learned.unseen_parameters
         for j in [*unseen, *(j for j in range(len(worst)) if j not in unseen)][:6]:
             task = worst.copy()
             task[j] = failed.point[j]
@@ -242,7 +243,9 @@ class IntervalSearch:
         rule = StoppingRule(self.limit, self.options.confidence, kind.resolution)
         now = rule.decide(self.recorder.trials, self.budget - self.recorder.trials.executions)
         if not now.decided:
-            return Choice(now.next_point, "covering", planned_draws=0)
+            # Whether the task is steady is not tested if there is no time for closed loops.
+            rejected = 0 if self.predicts and self.recorder.dynamics.ledger(self.recorder.trials).spent_up else None
+            return Choice(now.next_point, "covering", planned_draws=0, rejected=rejected)
         missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self.recorder.trials.ended))
         return self.test() if missing else None
 
@@ -258,8 +261,8 @@ class IntervalSearch:
             evidence = evidence if learned is None else replace(evidence, unvisited_region=learned.unvisited_region)
         if decides and unentered_pocket(evidence) is None:
             whole = dynamics.evidence(trials, confidence, keep=self.keeps)
-            if whole is None:
-                return self._by_distance()
+            if whole is None:  # more executions do not help if time is short
+                return None if dynamics.shortage is not None else self._by_distance()
             evidence = whole.needing(self.tests)
             with suppress(CertificateError):
                 sample = replace(Sample.of(trials.ended), threshold=self.limit)
@@ -278,7 +281,10 @@ class IntervalSearch:
             covers = not evidence.negligible and covering(self._points(trials), kind.resolution, 0) is not None
             if covers and self._by_distance() is None:
                 return None
-        return self.test() if lacks_tests else self._by_evidence(evidence)
+        ledger = dynamics.ledger(trials)
+        ledger.charge("loops", lambda costs: costs.next_task())
+        with ledger.spending("loops"):
+            return self.test() if lacks_tests else self._by_evidence(evidence)
 
     def _again(self, evidence: DynamicsEvidence) -> Array | None:
         """Return a task whose further execution tells what one execution of a noisy system does not; else None."""
@@ -304,7 +310,7 @@ class IntervalSearch:
         new = CandidateFilter(self._near, steady)
         # Tasks that differ in parameters that change no prediction are one task, with values that are spread.
         if learned is not None and self._suite is None:
-            new = CandidateFilter(self._near, steady, learned.spread_unseen, learned.study.seen_parameters)
+            new = CandidateFilter(self._near, steady, learned.spread_unseen, learned.seen_parameters)
         point = next_task(evidence, known, best, limit, self.options.confidence, new)
         if len(waiting) and (point is None or np.abs(waiting - point)[:, new.seen].max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.

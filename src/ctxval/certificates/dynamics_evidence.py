@@ -115,6 +115,7 @@ class DynamicsEvidence(ShortRepr):
     uneven: float = 1.0
     #: the largest distance under errors of M as small as all that were recorded; 0 if such errors are learned
     negligible: float = 0.0
+    replaced: tuple[str, ...] = ()  #: stages that were left out, or replaced by cheaper ones, for lack of time
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""
@@ -171,6 +172,7 @@ class DynamicsEvidence(ShortRepr):
                 "unvisited_region": pocket
                 and UnvisitedRegion(**{**pocket, "tasks": tuple(map(tuple, pocket["tasks"]))}),
                 "physical": tuple(values["physical"]),
+                "replaced": tuple(values.get("replaced", ())),
                 "executed": tuple(
                     ExplainedExecution(
                         **{**each, **{name: tuple(each[name]) for name in ("point", "quantiles", "p_values")}}

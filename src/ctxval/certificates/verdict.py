@@ -38,6 +38,7 @@ class Verdict:
     expected: Forecast | None = None  #: a forecast of further executions; None if nothing can be predicted
     rests_on: str | None = None  #: the evidence for a validation, its conditions, and what holds without; else None
     next_task: Mapping[str, Any] | None = None  #: the task to execute next, if learned dynamics choose it; else None
+    shortage: Mapping[str, Any] | None = None  #: the code and the seconds of thinking that are missing; else None
 
     @property
     def bound(self) -> float | None:
@@ -63,7 +64,8 @@ class Verdict:
     def to_json(self) -> dict[str, Any]:
         """Return the answer and its reasons, ready for JSON; the certificate has its own."""
         names = ("reason", "rests_on", "threshold", "next_task")
-        return {"verdict": self.answer, **{name: getattr(self, name) for name in names}}
+        thinking = {} if self.shortage is None else {"thinking": dict(self.shortage)}
+        return {"verdict": self.answer, **{name: getattr(self, name) for name in names}, **thinking}
 
 
 @checked

@@ -21,10 +21,8 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
-from ctxval.learning.closed_loops import LoopPlanner
+from ctxval.core.validation import Validation
 from ctxval.learning.worst_case import WorstCaseSettings
-
-THINKING = "thinking"  #: key in the note of a trial: the speed of the machine, and what the choice of its task took
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,7 @@ class ThinkingSettings:
     decisive: float = 12.0  # multiple of these that the evidence of a verdict may take; 1 if the budget is stated
     shares: tuple[float, ...] = (1.0, 0.25, 0.06)  # of the tasks of a search, the largest that fits
     few_draws: int = 8  # posterior samples that predict an execution if all of them do not fit
-    slower: tuple[float, float] = (0.7, 4.0)  # bounds of the correction by the choice before
+    slower: tuple[float, float] = (0.8, 4.0)  # bounds of the correction by the choice before
     noted: float = 0.02  # least share of the budget that a stage must take to be corrected by
     probe: float = 3.2e-3  # of a product, a factorisation and exponentials that measure the machine
     step: float = 7e-5  # of one step of closed loops that run together, beside controller and M
@@ -68,11 +66,12 @@ class Speed:
     step: float  #: of one step of a closed loop on M
     another_step: float  #: of each further loop that runs together with it
     together: bool  #: whether controllers take several draws of the dynamics at once
+    batched: bool  #: whether several tasks are planned at once
 
     @classmethod
-    def measured(cls, planner: LoopPlanner, points: Array, settings: ThinkingSettings) -> Self | None:
+    def measured(cls, parts: Validation, points: Array, settings: ThinkingSettings) -> Self | None:
         """Measure the speed at tasks ``(q, d)``, one of them alone; None if it cannot be planned."""
-        parts, machine = planner.validation, _probe() / settings.probe
+        machine = _probe() / settings.probe
 
         def task_at(rows: Array) -> Task:
             return parts.task_at(parts.space.parameters(parts.space.from_unit(rows)))
@@ -92,13 +91,16 @@ class Speed:
                 if together:
                     seconds = _seconds_of_step(controller, draws, parts.closed_loop)
                     another_step = float(np.clip((seconds - step) / (many - 1), 0.0, step))
-            if planner.batched:
-                batch = task_at(points)
-                designed, seconds = _timed(lambda: parts.synthesizer.design(batch, parts.model))
-                another_design = float(np.clip((seconds - design) / (len(points) - 1), 0.0, design))
-                seconds = _seconds_of_step(designed, batch, parts.closed_loop)
-                another_step = float(np.clip((seconds - step) / (len(points) - 1), 0.0, step))
-            return cls(machine, design, another_design, step, another_step, together)
+            batched = False
+            if getattr(parts.synthesizer, "batched", False) and len(points) > 1:
+                with suppress(Exception):  # tasks that may never be executed
+                    batch = task_at(points)
+                    designed, seconds = _timed(lambda: parts.synthesizer.design(batch, parts.model))
+                    another_design = float(np.clip((seconds - design) / (len(points) - 1), 0.0, design))
+                    seconds = _seconds_of_step(designed, batch, parts.closed_loop)
+                    another_step = float(np.clip((seconds - step) / (len(points) - 1), 0.0, step))
+                    batched = True
+            return cls(machine, design, another_design, step, another_step, together, batched)
         return None
 
     @classmethod
@@ -106,7 +108,7 @@ class Speed:
         """Return the speed in the note of a trial; None if these are not its values."""
         with suppress(TypeError, ValueError, AttributeError):
             speed = cls(**values)
-            numbers = [value for name, value in vars(speed).items() if name != "together"]
+            numbers = [value for name, value in vars(speed).items() if name not in ("together", "batched")]
             if all(isinstance(each, int | float) and 0 <= each < np.inf for each in numbers):
                 return speed
         return None
@@ -161,15 +163,12 @@ class Sizes:
     centres: int
 
     @classmethod
-    def of(cls, planner: LoopPlanner, states: Array, inputs: Array, executions: int) -> Self:
+    def of(cls, dimension: int, states: Array, inputs: Array, executions: int, batched: bool) -> Self:
         """Return the sizes after so many executions like one with states ``(H + 1, n)`` and inputs ``(H, m)``."""
         horizon = len(inputs)
         transitions = min(executions * horizon, 3000)
         centres = min(transitions, int(np.clip(30_000 // max(horizon, 1), 150, 400)))
-        return cls(
-            states.shape[-1], inputs.shape[-1], horizon, transitions, executions, planner.validation.space.dimension,
-            planner.batched, centres,
-        )  # fmt: skip
+        return cls(states.shape[-1], inputs.shape[-1], horizon, transitions, executions, dimension, batched, centres)
 
 
 @dataclass(frozen=True)
@@ -225,6 +224,10 @@ class Costs:
         pivots = s.centres * (settings.pivot + settings.pivot_row * s.transitions)
         return self._own(0.01 + 2 * pivots + 1e-8 * s.transitions * s.centres + 2e-10 * (s.centres + 100) ** 3)
 
+    def learning(self) -> float:
+        """Return the seconds of both."""
+        return self.hyperparameters() + self.posterior()
+
     def draws(self, hyperparameters: int) -> float:
         """Return the seconds of draws with so many sets of hyperparameters, which are drawn themselves."""
         curvature = 3 * (2 * (self._coordinates + 3) + 48) * self._density()
@@ -256,11 +259,17 @@ class Costs:
         settings, s = self.thinking.settings, self.sizes
         D, rows = self.features(centres=32) * s.states, s.transitions * s.states
         steps = 5 * (1 + s.executions * s.horizon * s.states * 2e-6) * 0.02
-        return self._own(5 * (settings.invert * D**3 + settings.moments * rows * D**2 + 2e-9 * rows * s.states * D) + steps)
+        return self._own(
+            5 * (settings.invert * D**3 + settings.moments * rows * D**2 + 2e-9 * rows * s.states * D) + steps
+        )
 
     def noise_on_distances(self) -> float:
         """Return the seconds that tell whether noise and starts matter to distances."""
         return self.plan(38) + 2 * self.run(1, 32) + 10 * self.run(1, 6)
+
+    def usual_lags(self) -> float:
+        """Return the seconds that tell whether histories predict better."""
+        return sum(self.evidence_of_lags(each, 2) for each in (1, 2, 3))
 
     def lags(self, structures: Sequence[int]) -> float:
         """Return the seconds of the most probable of structures with so many lags."""
@@ -269,20 +278,24 @@ class Costs:
 
     # Searches
 
-    def search(self, settings: WorstCaseSettings, replicates: float = 1.0) -> float:
+    def search(self, settings: WorstCaseSettings, replicates: float = 1.0, *, whole: bool = True) -> float:
         """Return the seconds of a search on the mean, with the pool's plans and the coverage of their loops."""
         tasks = min(1500, settings.evaluations)
         loops = self.run(1, settings.pool, replicates) + self.run(1, tasks, min(replicates, 3.0), self._batches(tasks))
-        beside = self.plan(16 * self.sizes.dimension) if settings.pool > 16 else 0.0
+        loops += self.run(1, self.sizes.executions)
+        beside = self.plan(16 * self.sizes.dimension) if whole else 0.0  # parameters that change no loop
         return self.plan(settings.pool) + self.plan(tasks) + loops + beside + self._own(0.05)
 
     def _batches(self, tasks: float) -> float | None:
         return 20.0 if self.sizes.batched and tasks > 64 else None  # an ascent has many small batches
 
-    def screening(self, settings: WorstCaseSettings, replicates: float = 1.0) -> float:
+    def screening(self, settings: WorstCaseSettings, replicates: float = 1.0, rests: bool = False) -> float:
         """Return the seconds of a few draws on some tasks."""
         tasks = settings.local_maxima + settings.shared // 4 + self.sizes.executions
-        return self.draws(8) + self.plan(tasks) + self.run(1, tasks) + self.run(8, tasks, replicates)
+        own = 8 * settings.rounds * (2 * self.sizes.dimension + settings.moves + 1) if rests else 0
+        tasks += 256 if rests else 0  # friction at rest differs
+        seconds = self.draws(8) + self.plan(tasks + own) + self.run(1, tasks) + self.run(8, tasks, replicates)
+        return seconds + self.run(1, own, replicates, 8.0)
 
     def prediction(self, draws: int, replicates: float = 1.0) -> float:
         """Return the seconds of the prediction of one execution."""
@@ -329,8 +342,9 @@ class Ledger:
     """
 
     def __init__(self, costs: Costs | None = None) -> None:
-        self.costs = costs
+        self.costs, self.reserve, self.spent_up = costs, 0.0, False
         self.replaced: list[str] = []
+        self.missing = 0.0  # seconds of a stage without which there is no evidence
         self.incomplete = 0.0  # seconds of stages of learning that were left out
         self.expected: dict[str, float] = {}
         self.spent: dict[str, float] = {}
@@ -347,9 +361,15 @@ class Ledger:
         """The seconds that no stage has taken."""
         return np.inf if self.costs is None else self.costs.thinking.seconds - sum(self.expected.values())
 
-    def lift(self) -> None:
-        """Take all stages from now on."""
-        self.costs = None
+    @contextmanager
+    def within(self, thinking: Thinking) -> Iterator[None]:
+        """Have another budget meanwhile."""
+        before = self.costs
+        self.costs = None if before is None else replace(before, thinking=thinking)
+        try:
+            yield
+        finally:
+            self.costs = before
 
     def seconds(self, kind: str, of: Callable[[Costs], float]) -> float:
         """Return the expected seconds of a stage of a kind; 0 without a budget."""
@@ -357,22 +377,40 @@ class Ledger:
             return 0.0
         return dict(self.costs.thinking.slower).get(kind, 1.0) * of(self.costs)
 
+    def charge(self, kind: str, of: Callable[[Costs], float]) -> None:
+        """Take a stage that is needed in any case."""
+        self.add(kind, self.seconds(kind, of))
+
+    def add(self, kind: str, seconds: float) -> None:
+        """Take a stage of so many seconds."""
+        if self.costs is not None:
+            self.expected[kind] = self.expected.get(kind, 0.0) + seconds
+
     def fits(self, kind: str, of: Callable[[Costs], float], reserve: float = 0.0) -> bool:
         """Take a stage of a kind if it fits, and leaves a reserve; return whether it does."""
         seconds = self.seconds(kind, of)
         if seconds + reserve > self.left:
             return False
-        if self.costs is not None:
-            self.expected[kind] = self.expected.get(kind, 0.0) + seconds
+        self.charge(kind, of)
         return True
 
-    def learns(self, kind: str, stage: str, of: Callable[[Costs], float], reserve: float = 0.0) -> bool:
-        """As :meth:`fits`, of a stage of learning: without it, what is learned decides nothing."""
-        if self.fits(kind, of, reserve):
+    def learns(self, kind: str, stage: str, of: Callable[[Costs], float]) -> bool:
+        """As :meth:`fits`, of a stage of learning: without it, what is learned decides nothing.
+
+        It leaves what the choice of a task needs in any case, ``reserve``.
+        """
+        if self.fits(kind, of, self.reserve):
             return True
         self.incomplete += self.seconds(kind, of)
         self.replaced.append(stage)
         return False
+
+    def optional(self, kind: str, stage: str, of: Callable[[Costs], float]) -> bool:
+        """As :meth:`fits`, of a stage that tells more, and on which no verdict rests."""
+        fits = self.fits(kind, of, self.reserve)
+        if not fits:
+            self.replaced.append(stage)
+        return fits
 
     @contextmanager
     def spending(self, kind: str) -> Iterator[None]:

@@ -26,6 +26,7 @@ class Costs:
     evaluation: float | None  # infinity if people make it, and None if none was timed
     rough: float | None = None  # of the rough prediction of one point; that of the prediction if None
     batch: float = 0.0  # of each batch besides those of its points
+    thinking: float | None = None  # that a choice may take; None if that is not stated
 
 
 @dataclass(frozen=True, eq=False)
