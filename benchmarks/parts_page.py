@@ -65,7 +65,7 @@ def page() -> str:
 
 
 def _lines(section: Section) -> list[str]:
-    heading = [f"## {section.title}", "", f"{section.use}.", "", "| name | what it is | arguments |", "|---|---|---|"]
+    heading = [f"## {section.title}", "", f"{section.use}.", "", "| name | part | arguments |", "|---|---|---|"]
     return [*heading, *(_row(section.registry, name) for name in section.registry.built_in), ""]
 
 
