@@ -564,9 +564,8 @@ class Campaign:
         with progress_shown(progress), stage("certifying"), recorder.dynamics.thinking.limited(thinking):
             verdict = judge(recorder.trials, threshold, options, self.provenance)
             shortage = recorder.dynamics.shortage
-            if shortage is not None and verdict.answer != "falsified":
-                # Another bound has not seen what the evidence might have shown, such as noise.
-                return Verdict("undecided", verdict.threshold, f"{shortage}.", shortage=shortage.to_json())
+            if shortage is not None and verdict.answer == "undecided":
+                return replaced(verdict, shortage=shortage.to_json())
             return with_next_task(verdict, recorder, options)
 
     @checked

@@ -26,7 +26,7 @@ from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import REDEFINED, Trial, Trials
 from ctxval.core.validation import Validation
-from ctxval.errors import CertificateError
+from ctxval.errors import CertificateError, NoTimeError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.coverage import unsampled_corner
 from ctxval.learning.prediction import Executed
@@ -94,7 +94,7 @@ class CampaignDynamics:
         key = (self.thinking.after(trials), allowed, *results, *map(id, others))
         if key not in self._learned:
             learned, failure = None, None
-            ledger = self.thinking.ledger(trials, [trajectory for _, trajectory in executed])
+            ledger = self.thinking.ledger(trials, len(executed))
             try:
                 with ledger.spending("learning"):
                     if not ledger.spent_up:
@@ -353,13 +353,14 @@ class CampaignDynamics:
             before = completed[:place]
             prediction = stored = self.stored_prediction(trial)
             if stored is None:
-                recent = place >= len(completed) - PREDICTIONS - 1
-                if not recent or self.learned(before, alone=True) is None:
+                if place < len(completed) - PREDICTIONS - 1:
                     continue
                 stage = "predictions of executions afterwards"
                 if not self.ledger(trials).optional(
                     "learning", stage, lambda costs: costs.learning() + costs.prediction(40)
                 ):
+                    continue
+                if self.learned(before, alone=True) is None:
                     continue
                 key = tuple((each.number, each.distance) for each in completed[: place + 1])
                 if key not in self._afterwards:
@@ -412,7 +413,7 @@ class LearnedFromTrials:
         self.study.use_quantile(quantile)
         evidence = self.study.evidence(self.trials, confidence)
         if evidence is None and self.study.shortage is not None:
-            raise CertificateError(f"{self.study.shortage}.")
+            raise NoTimeError(f"{self.study.shortage}.")
         if evidence is None and self.study.failure is not None:
             raise CertificateError(f"no dynamics can be learned: {self.study.failure.rstrip('.')}.")
         return evidence

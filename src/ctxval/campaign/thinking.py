@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ctxval.core.trajectory import Trajectory
+from ctxval.core.trajectory import Transitions
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.learning.thinking import Costs, Ledger, Sizes, Speed, Thinking, ThinkingSettings, reduced, speed_to_json
@@ -116,14 +116,16 @@ class CampaignThinking:
         members = None if space.members is None else len(space.members)
         return settings if members is None else replace(settings, pool=members, evaluations=members, rounds=0)
 
-    def ledger(self, trials: Sequence[Trial], executed: Sequence[Trajectory]) -> Ledger:
+    def ledger(self, trials: Sequence[Trial], executions: int) -> Ledger:
         """Return the ledger of the next choice, which is ``spent`` if nothing can be learned within its budget."""
         thinking = self.after(trials)
-        if thinking is None or not executed:
+        if thinking is None:
             return Ledger()
         space, settings = self._validation.space, self.search_settings
         smallest = settings if space.members is not None else reduced(settings, thinking.settings.shares[-1])
-        sizes = Sizes.of(space.dimension, executed[0].states, executed[0].inputs, len(executed), thinking.speed.batched)
+        data = getattr(self._validation.model, "data", None)
+        known = min(len(data), 600) if isinstance(data, Transitions) else 0
+        sizes = Sizes.of(thinking.speed, space.dimension, executions, known)
         ledger, few = Ledger(Costs(thinking, sizes)), thinking.settings.few_draws
         ledger.reserve = ledger.seconds("loops", lambda costs: costs.prediction(few) + costs.next_task())
         learning = ledger.seconds("learning", lambda costs: costs.learning())

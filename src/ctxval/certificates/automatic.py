@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -21,7 +20,7 @@ from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences.statements import EXECUTED_AGAIN
 from ctxval.certificates.sentences.verdicts import supported as supported_by
 from ctxval.core.quantiles import QUANTILE
-from ctxval.errors import CertificateError
+from ctxval.errors import CertificateError, NoTimeError
 
 
 @part("suite")
@@ -82,10 +81,14 @@ class Automatic(CertificateKind):
             return WholeSuite().certify(sample, confidence)
         by_dynamics = None
         if uses_dynamics:
-            with suppress(CertificateError):
+            try:
                 by_dynamics = Dynamics(tests=self.tests, quantile=self.quantile).certify(sample, confidence)
                 if by_dynamics.details["quantile"] is not None or _decides(by_dynamics, threshold):
                     return by_dynamics  # the posterior bound of the distance is about systems without noise
+            except NoTimeError:
+                raise  # another bound has not seen what this evidence might show, such as noise
+            except CertificateError:
+                pass
         if sample.suite is not None:
             return by_dynamics or WholeSuite().certify(sample, confidence)
         preferred = False

@@ -19,6 +19,7 @@ from ctxval._util.latest import Latest
 from ctxval.core.model import Model
 from ctxval.errors import InputError
 from ctxval.learning.closed_loops import AnyPosterior, LoopPlanner
+from ctxval.learning.draws import Draws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import History, Record, Structure
@@ -81,9 +82,9 @@ class NoiseStudy:
         settings = self.settings
         # Executions do not follow from task, state and input if noise, or what is not recorded, acts.
         is_needed = float((posterior.most_probable.noise**2).max()) > settings.noisy
-        if not is_needed and not ledger.learns(
-            "noise", "whether noise matters", lambda costs: costs.noise_on_distances()
-        ):
+        varies = not is_needed and any(self._varies(posterior, starts) for starts in (None, _scatter_of(records)))
+        stage = "whether noise matters"
+        if varies and not ledger.learns("noise", stage, lambda costs: costs.noise_on_distances()):
             return None
         is_needed = is_needed or self._effect(posterior) > settings.matters
         is_needed = is_needed or self._effect(posterior, _scatter_of(records)) > settings.matters
@@ -168,16 +169,27 @@ class NoiseStudy:
         horizon, seed = max(len(record.inputs) for record in records), (self.seed, len(records))
         return NoisyPosterior(fit, data, _scatter_of(records), horizon, replicates, self.quantile, seed), chosen
 
+    def _noisy(self, posterior: AnyPosterior) -> Draws | None:
+        return posterior.with_noise(self.settings.runs, self._rounding(posterior))
+
+    def _rounding(self, posterior: AnyPosterior) -> Array:
+        return self.settings.rounding * posterior.data.scale[: len(posterior.data.sizes)]
+
+    def _varies(self, posterior: AnyPosterior, starts: Array | None) -> bool:
+        """Return whether noise, or starts with such deviations ``(n,)`` if they are given, are more than rounding."""
+        if starts is None:
+            return self._noisy(posterior) is not None
+        return bool((starts > self._rounding(posterior)).any())
+
     def _effect(self, posterior: AnyPosterior, starts: Array | None = None) -> float:
         """Return the largest standard deviation of a task's distance over noise, as a share of the largest distance.
 
         If they are given, it is that over starts with such deviations ``(n,)``. The tasks have large finite distances.
         """
         planner, settings = self.planner, self.settings
-        rounding = settings.rounding * posterior.data.scale[: len(posterior.data.sizes)]
-        noisy = posterior.with_noise(settings.runs, rounding) if starts is None else None
-        if noisy is None and (starts is None or not (starts > rounding).any()):
+        if not self._varies(posterior, starts):
             return 0.0
+        noisy = self._noisy(posterior) if starts is None else None
         silent = posterior.mean.without_noise()
         with single_threaded(), np.errstate(all="ignore"):
             tasks = self.search.pool[: settings.pool]

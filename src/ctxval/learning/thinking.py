@@ -19,9 +19,9 @@ from typing import Any, Self
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
-from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.validation import Validation
+from ctxval.learning.dynamics_posterior import PosteriorSettings
 from ctxval.learning.worst_case import WorstCaseSettings
 
 
@@ -67,6 +67,10 @@ class Speed:
     another_step: float  #: of each further loop that runs together with it
     together: bool  #: whether controllers take several draws of the dynamics at once
     batched: bool  #: whether several tasks are planned at once
+    # states, inputs, horizon: the numbers n and m, and the steps H of a task
+    states: int
+    inputs: int
+    horizon: int
 
     @classmethod
     def measured(cls, parts: Validation, points: Array, settings: ThinkingSettings) -> Self | None:
@@ -83,10 +87,9 @@ class Speed:
             many = 8
             draws = one.starting_at(np.repeat(one.initial_state[None], many, axis=0))
             together, another_step, another_design = False, step, design
+            alone = parts.closed_loop(controller, _shortened(one, 1)).inputs
             with suppress(Exception):  # a controller that takes one state alone
-                short = _shortened(draws, 1)
-                inputs = rollout(lambda x, u: x, controller, short).inputs
-                alone = rollout(lambda x, u: x, controller, _shortened(one, 1)).inputs
+                inputs = parts.closed_loop(controller, _shortened(draws, 1)).inputs
                 together = inputs.shape == (many, *alone.shape) and np.allclose(inputs, alone)
                 if together:
                     seconds = _seconds_of_step(controller, draws, parts.closed_loop)
@@ -100,7 +103,8 @@ class Speed:
                     seconds = _seconds_of_step(designed, batch, parts.closed_loop)
                     another_step = float(np.clip((seconds - step) / (len(points) - 1), 0.0, step))
                     batched = True
-            return cls(machine, design, another_design, step, another_step, together, batched)
+            sizes = one.initial_state.shape[-1], alone.shape[-1], one.horizon
+            return cls(machine, design, another_design, step, another_step, together, batched, *sizes)
         return None
 
     @classmethod
@@ -163,12 +167,12 @@ class Sizes:
     centres: int
 
     @classmethod
-    def of(cls, dimension: int, states: Array, inputs: Array, executions: int, batched: bool) -> Self:
-        """Return the sizes after so many executions like one with states ``(H + 1, n)`` and inputs ``(H, m)``."""
-        horizon = len(inputs)
-        transitions = min(executions * horizon, 3000)
-        centres = min(transitions, int(np.clip(30_000 // max(horizon, 1), 150, 400)))
-        return cls(states.shape[-1], inputs.shape[-1], horizon, transitions, executions, dimension, batched, centres)
+    def of(cls, speed: Speed, dimension: int, executions: int, known: int) -> Self:
+        """Return the sizes after so many executions, with so many known transitions beside them."""
+        transitions = min(executions * speed.horizon + known, 3000)
+        centres = min(transitions, PosteriorSettings.for_horizon(speed.horizon).centres)
+        sizes = speed.states, speed.inputs, speed.horizon, transitions, executions, dimension
+        return cls(*sizes, speed.batched, centres)
 
 
 @dataclass(frozen=True)
@@ -441,7 +445,7 @@ class Ledger:
 
 def speed_to_json(speed: Speed) -> dict[str, Any]:
     """Return a speed as a trial stores it, with three digits."""
-    return {name: value if isinstance(value, bool) else float(f"{value:.3g}") for name, value in asdict(speed).items()}
+    return {name: value if isinstance(value, int) else float(f"{value:.3g}") for name, value in asdict(speed).items()}
 
 
 def reduced(settings: WorstCaseSettings, share: float) -> WorstCaseSettings:
