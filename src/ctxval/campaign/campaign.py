@@ -565,7 +565,7 @@ class Campaign:
             verdict = judge(recorder.trials, threshold, options, self.provenance)
             shortage = recorder.dynamics.shortage
             if shortage is not None and verdict.answer == "undecided":
-                return replaced(verdict, shortage=shortage.to_json())
+                verdict = replaced(verdict, shortage=shortage.to_json())
             return with_next_task(verdict, recorder, options)
 
     @checked

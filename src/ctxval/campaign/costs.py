@@ -73,9 +73,7 @@ class ThinkingCosts:
         return cls(design, loop, choice, verdict, learning + thorough, designs, learning + fast)
 
 
-def costs_of(
-    prediction: Prediction, validation: Validation, trials: Sequence[Trial], thinking: float | None = None
-) -> Costs:
+def costs_of(prediction: Prediction, validation: Validation, trials: Sequence[Trial]) -> Costs:
     """Return the costs that decide how long a search thinks."""
     dimension, rng = validation.space.dimension, np.random.default_rng(0)
     batched = bool(getattr(validation.synthesizer, "batched", False))
@@ -94,7 +92,7 @@ def costs_of(
     execution = statistics.median(timed) if timed else None
     if getattr(validation.system, "manual", False):
         execution = math.inf
-    return Costs(each + more, execution, each, seconds - count * each, thinking)
+    return Costs(each + more, execution, each, seconds - count * each)
 
 
 def _seconds(work: Callable[[], object]) -> float:

@@ -30,7 +30,7 @@ from ctxval.errors import CertificateError, NoTimeError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.coverage import unsampled_corner
 from ctxval.learning.prediction import Executed
-from ctxval.learning.thinking import Ledger
+from ctxval.learning.stage_costs import Ledger
 from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
@@ -111,6 +111,10 @@ class CampaignDynamics:
         self.learned(trials)
         return self._ledger
 
+    def has_no_time(self, trials: Sequence[Trial]) -> bool:
+        """Return whether the budget of the choice after trials allows no closed loops; nothing is learned."""
+        return self.thinking.ledger(trials, len(executed_trials(self._store, trials))).spent_up
+
     def note(self, trials: Sequence[Trial]) -> dict[str, Any]:
         """Return what the next trial stores of the thinking on its task; empty without a budget."""
         note = self.thinking.note(trials, self.ledger(trials) if trials else Ledger())
@@ -173,9 +177,9 @@ class CampaignDynamics:
         It has a few draws, and none but the posterior mean after fewer executions than a bound needs. With ``pending``
         as in :meth:`prediction`, it helps to choose a task and decides nothing.
         """
-        ledger = self.ledger(trials)
-        if ledger.spent_up:
+        if self.has_no_time(trials):
             return None
+        ledger = self.ledger(trials)
         loops = self.study.search.screening_loops
         with stage("searching the learned dynamics", loops, "closed loops"), ledger.spending("loops"):
             learned = self.learned(trials)

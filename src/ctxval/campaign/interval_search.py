@@ -121,7 +121,8 @@ class IntervalSearch:
         trials = self.recorder.trials
         if not self.recorder.has_tasks:
             return None
-        self.recorder.dynamics.thinking.measure(trials)
+        if self.recorder.predicts:  # what only reads a store chooses as the stored speed allows
+            self.recorder.dynamics.thinking.measure(trials)
         if self.threshold is not None and any(trial.least > self.threshold for trial in trials):
             repeated = self._against_noise()
             if repeated is not None or self.is_falsified:
@@ -244,7 +245,7 @@ class IntervalSearch:
         now = rule.decide(self.recorder.trials, self.budget - self.recorder.trials.executions)
         if not now.decided:
             # Whether the task is steady is not tested if there is no time for closed loops.
-            rejected = 0 if self.predicts and self.recorder.dynamics.ledger(self.recorder.trials).spent_up else None
+            rejected = 0 if self.recorder.dynamics.has_no_time(self.recorder.trials) else None
             return Choice(now.next_point, "covering", planned_draws=0, rejected=rejected)
         missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self.recorder.trials.ended))
         return self.test() if missing else None

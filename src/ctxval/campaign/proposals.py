@@ -127,15 +127,17 @@ class Proposals:
                 if prediction is not None:
                     expected = prediction.expected
                     steady = DesignContinuity(self._dynamics.study.planner, lambda points: expected(points)[0])
-                    costs = partial(costs_of, prediction, self._validation, trials, self.thinking)
+                    costs = partial(costs_of, prediction, self._validation, trials)
                     left = remaining_tasks(self._validation, trials)
-                    prediction = replace(prediction, costs=costs, steady=steady, candidates=left)
+                    known = {"costs": costs, "steady": steady, "candidates": left, "thinking": self.thinking}
+                    prediction = replace(prediction, **known)
                 search.use_prediction(prediction)
             point, note = self._asked()
             repeats = self._validation.space.members is None
             if repeats and any(point.tobytes() == trial.unit_point.tobytes() for trial in trials):
                 return point, note
-            point, note = self._final(point, trials, None if search.iid else steady, note, rejected)
+            untested = search.iid or self._dynamics.has_no_time(trials)
+            point, note = self._final(point, trials, None if untested else steady, note, rejected)
             if isinstance(search, SequentialSearch):
                 search.amend(point)
             return point, note

@@ -13,7 +13,7 @@ import numpy as np
 from ctxval.core.trajectory import Transitions
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
-from ctxval.learning.thinking import Costs, Ledger, Sizes, Speed, Thinking, ThinkingSettings, reduced, speed_to_json
+from ctxval.learning.stage_costs import Costs, Ledger, Sizes, Speed, Thinking, ThinkingSettings, reduced, speed_to_json
 from ctxval.learning.worst_case import WorstCaseSettings
 
 THINKING = "thinking"  #: key in the note of a trial: the speed of the machine, and what the choice of its task took

@@ -239,7 +239,8 @@ class TrialRecorder:
             self.search.tell(unit_point[None], [np.nan])
         if origin == "iid" and choice.planned_draws is not None:
             note = {**(note or {}), PLANNED: choice.planned_draws}
-        self.dynamics.thinking.measure(trials)
+        if self.predicts:
+            self.dynamics.thinking.measure(trials)
         if self.predicts and (predicted := self.dynamics.predict(trials, unit_point)) is not None:
             note = {**(note or {}), PREDICTION: {**predicted.to_json(), "experiment": self.dynamics.experiment}}
         if self.predicts and (thought := self.dynamics.note(trials)):

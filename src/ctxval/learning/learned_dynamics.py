@@ -32,7 +32,7 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.regular import Boundary, RegularTransitions
-from ctxval.learning.thinking import Costs, Ledger
+from ctxval.learning.stage_costs import Costs, Ledger
 from ctxval.learning.tolerance import push_response
 from ctxval.learning.worst_case import WorstCase, WorstCaseSearch
 

@@ -26,7 +26,7 @@ from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.innovations import FilterFit, InnovationsFit, LaggedFit, fit_filter, fit_lagged
 from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.recorded import digest, scheduled
-from ctxval.learning.thinking import Costs, Ledger
+from ctxval.learning.stage_costs import Costs, Ledger
 from ctxval.learning.worst_case import WorstCaseSearch
 
 

@@ -26,7 +26,6 @@ class Costs:
     evaluation: float | None  # infinity if people make it, and None if none was timed
     rough: float | None = None  # of the rough prediction of one point; that of the prediction if None
     batch: float = 0.0  # of each batch besides those of its points
-    thinking: float | None = None  # that a choice may take; None if that is not stated
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +51,7 @@ class Prediction(ShortRepr):
     rough: Callable[[Array], tuple[Array, Array]] | None = None  # an approximation of ``expected`` that is cheaper
     steady: Callable[[Array], bool] | None = None  # whether a point has the value of its neighbours; None if all have
     pending: Pending | None = None  # the points that are being evaluated
+    thinking: float | None = None  # seconds that the choice may take; None if they are not stated
     candidates: Array | None = None  # the only points that may be evaluated (r, d); None if all may
 
 

@@ -146,10 +146,11 @@ class Thinking:
         low, high = settings.slower
         ratios: dict[str, float] = {}
         for note in notes:
-            for kind, (expected, spent) in note.get("spent", {}).items():
-                if expected >= settings.noted * seconds:
-                    # What was kept from earlier choices takes no time, and may have to be computed again.
-                    ratios[kind] = float(np.clip(ratios.get(kind, 1.0) * spent / expected, low, high))
+            with suppress(AttributeError, TypeError, ValueError):  # the note of a store
+                for kind, (expected, spent) in note.get("spent", {}).items():
+                    if expected >= settings.noted * seconds:
+                        # What was kept from earlier choices takes no time, and may have to be computed again.
+                        ratios[kind] = float(np.clip(ratios.get(kind, 1.0) * spent / expected, low, high))
         return cls(seconds, many * seconds, speed, tuple(ratios.items()), settings)
 
 
