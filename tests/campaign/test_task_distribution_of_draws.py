@@ -22,7 +22,7 @@ from ctxval.certificates import (
 )
 from ctxval.cli import app
 from ctxval.cli.config.settings import read_settings
-from ctxval.cli.config.signatures import code_named
+from ctxval.cli.config.trust import code_named
 from ctxval.core.space import DISTRIBUTION
 from ctxval.core.task_distribution import distribution_text
 from ctxval.errors import CtxvalError, InputError, StoreMismatchError, UnknownNameError

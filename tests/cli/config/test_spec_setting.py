@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ctxval.cli.config.settings import ExperimentSettings
-from ctxval.cli.config.signatures import code_named
+from ctxval.cli.config.trust import code_named
 from ctxval.distances import MaximumDeviation, UnsafeMargin
 from ctxval.errors import InputError
 

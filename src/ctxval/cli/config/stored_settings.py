@@ -1,4 +1,4 @@
-"""The settings in a store, those that may be used, since this user has signed what names code, and the campaign."""
+"""The settings in a store, those that may be used, since this user allows the code that they name, and the campaign."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ctxval.certificates import KINDS
 from ctxval.cli.base import Allowed, err
 from ctxval.cli.config.parts import REGISTRIES
 from ctxval.cli.config.settings import ExperimentSettings, not_an_experiment, read_settings, sentence_of
-from ctxval.cli.config.signatures import code_named, unsigned, verifies, why_no_key
+from ctxval.cli.config.trust import allow, code_named, is_allowed
 from ctxval.errors import InputError
 
 
@@ -30,7 +30,7 @@ def planned_settings(store: Store, kind: str | None = None) -> ExperimentSetting
         return ExperimentSettings()
     settings = _of_store(kept)
     planned = settings.certificate.kind
-    if kind is None and not KINDS.is_data(planned) and not verifies(kept):
+    if kind is None and not KINDS.is_data(planned) and not is_allowed(kept):
         why = f"{store.name} names the certificate {planned!r}, which is code of another package"
         how = f"Give --kind {planned} if you trust that package, or give another kind."
         raise InputError(f"{why}, and you did not make the store. {how}")
@@ -42,7 +42,7 @@ def _of_store(kept: dict[str, Any]) -> ExperimentSettings:
         why = "the store does not name its experiment, because it was not made by a command"
         raise InputError(f"{why}: name the experiment with --experiment FILE.toml.")
     try:
-        return ExperimentSettings.model_validate(unsigned(kept))
+        return ExperimentSettings.model_validate(kept)
     except ValidationError as error:
         raise InputError(sentence_of("the store's settings: ", error)) from error
 
@@ -63,8 +63,7 @@ def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool
     settings, code = _of_store(kept), code_named(kept)
     folder = settings.folder or Path().resolve()
     outside = [] if store.path is None else _files_outside(kept, folder, store.path.resolve().parent)
-    signed = (settings.folder is not None or not code) and verifies(kept)
-    if not (code or outside) or signed:
+    if not (code or outside) or (settings.folder is not None and is_allowed(kept)):
         return settings
     if trust:
         return settings.model_copy(update={"folder": folder})
@@ -75,7 +74,7 @@ def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool
         raise InputError(f"{store.path} names {files}. {unknown}. {known} store, give --trust.")
     more = f" and {len(code) - 8} more" if len(code) > 8 else ""
     what = f"{'; '.join(code[:8])}{more}, from the folder {ascii(str(folder))[:200]}"
-    then = "The store then carries your signature, and the question will not be asked again."
+    then = "The question will then not be asked again."
     known = f"{unknown}, or an older version made it. {known} code that the store names, give --trust"
     raise InputError(f"{store.path} would import or run code: {what}. {known}. {then}")
 
@@ -138,7 +137,7 @@ class Limits:
 def open_store(path: Path, allowed: Allowed, *, remeasure: bool = False) -> Opened:
     store = Store.existing(path)
     settings = trusted_settings(store, experiment=allowed.experiment, trust=allowed.trust)
-    asked = (allowed.trust or allowed.experiment is not None) and not verifies(store.settings())
+    asked = (allowed.trust or allowed.experiment is not None) and not is_allowed(store.settings())
     try:
         experiment = settings.load()
     except InputError as error:
@@ -149,9 +148,9 @@ def open_store(path: Path, allowed: Allowed, *, remeasure: bool = False) -> Open
         raise InputError(f"{error} {gone}: {how}.") from error
     campaign = settings.campaign(experiment, store, accept_change=allowed.accept_change, remeasure=remeasure)
     if asked and code_named(store.settings()):
-        does = "now carries your signature, and the question will not be asked again"
-        if (reason := why_no_key()) is not None:
-            does = f"cannot carry your signature, and the question will be asked again: {reason}"
+        does = "is now allowed to run its code, and the question will not be asked again"
+        if (reason := allow(store.settings())) is not None:
+            does = f"is allowed to run its code only now, and the question will be asked again: {reason}"
         err.say(f"{path} {does}.")
     return Opened(settings, experiment, campaign, path)
 
