@@ -66,7 +66,7 @@ def page() -> str:
 
 
 def _lines(section: Section) -> list[str]:
-    heading = [f"## {section.title}", "", f"{section.use}.", "", "| name | what it is | arguments |", "|---|---|---|"]
+    heading = [f"## {section.title}", "", f"{section.use}.", "", "| name | part | arguments |", "|---|---|---|"]
     return [*heading, *(_row(section.registry, name) for name in section.registry.built_in), ""]
 
 
@@ -92,7 +92,7 @@ def _arguments(build: Any, declared: Declaration) -> str:
 
 
 def _argument(name: str, default: Any, declared: Declaration | None = None) -> str:
-    text = f"`{name}`" if default is inspect.Parameter.empty else f"`{name} = {default!r}`"
+    text = f"`{name}`" if default is inspect.Parameter.empty else f"`{name}={default!r}`"
     if declared is not None and name in declared.files:
         return f"{text} (a file)"
     form = {} if declared is None else declared.functions
