@@ -57,7 +57,7 @@ def reflowed(text: str) -> str:
 
 
 def _is_kept(block: str) -> bool:
-    return not block.strip() or block.lstrip("\n")[0] in "|#!`<$"
+    return not block.strip() or block.lstrip("\n").startswith(("|", "#", "![", "```", "<", "$$"))
 
 
 def _filled(block: str) -> str:
@@ -73,7 +73,8 @@ def _filled(block: str) -> str:
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a Markdown table."""
-    return "\n".join("| " + " | ".join(line) + " |" for line in (header, ["---"] * len(header), *rows))
+    lines = ["| " + " | ".join(line) + " |" for line in (header, *rows)]
+    return "\n".join([lines[0], "|" + "---|" * len(header), *lines[1:]])
 
 
 def csv_text(table: Table) -> str:
