@@ -10,7 +10,7 @@ import numpy as np
 from calibrate_dynamics import BUDGETS, FALSE, FEW, GROUPS, RULE, STORED, TRUE, WITH_TESTS, wanted
 from calibration_verdicts_part import false_of, table
 from ctxval._util.json_lines import JsonLines
-from ctxval.certificates import dynamics_diagnostics as rule
+from ctxval.certificates.limits import LIMITS
 from study_interval import BUDGET as INTERVAL_BUDGET
 from study_interval import SEEDS as INTERVAL_SEEDS
 from study_interval import rows as interval_rows
@@ -157,10 +157,10 @@ def by_dynamics() -> str:
         present_table=_table(present),
         run=len(reported),
         planned=len(list(wanted("reporting"))),
-        accurate=rule.ACCURATE,
-        predictions=rule.PREDICTIONS,
-        gap=rule.GAP,
-        beyond=rule.BEYOND,
+        accurate=LIMITS.error,
+        predictions=LIMITS.predictions,
+        gap=LIMITS.gap,
+        beyond=LIMITS.beyond,
         at_95=false_of(_at(reported, FALSE[0]))[1],
         at_99=false_of(_at(reported, FALSE[1]))[1],
         misleading_95=false_of([one for one in _at(reported, FALSE[0]) if _entry(one).misleading])[1],

@@ -201,8 +201,8 @@ def predicted() -> learning.ExecutionPrediction:
     return found
 
 
-def evidence() -> certificates.DynamicsEvidence:
-    return certificates.DynamicsEvidence(
+def evidence() -> certificates.Evidence:
+    return certificates.Evidence(
         np.linspace(0.9, 1, 40), np.zeros((40, 2)), 0.95, np.zeros((5, 2)), 9000, 4, 0.01, 1e-6, (CHECKED,), COVERED
     )
 
@@ -366,7 +366,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.CertificateOptions": lambda: BY_POSTERIOR,
     "certificates.CheckedPrediction": lambda: CHECKED,
     "certificates.Dynamics": certificates.Dynamics,
-    "certificates.DynamicsEvidence": evidence,
+    "certificates.Evidence": evidence,
     "certificates.Neighbour": lambda: certificates.Neighbour(Path("other.sqlite")),
     "certificates.DistanceBound": certificates.DistanceBound,
     "certificates.Provenance": lambda: certificates.Provenance(remarks=("fuse replaced",)),
