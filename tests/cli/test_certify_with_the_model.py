@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 
 from ctxval import Store
 from ctxval.cli import app
-from ctxval.cli.config import signatures
+from ctxval.cli.config import trust
 
 pytestmark = pytest.mark.slow
 
@@ -150,11 +150,11 @@ def test_code_of_another_user_is_asked_about_first(tmp_path: Path, monkeypatch: 
     assert invoke("certify", "r.sqlite", "--audit", "12").exit_code == 0
     own = invoke("certify", "r.sqlite", "--kind", "region")
     assert own.exit_code == 0, own.output
-    signatures.key_path().unlink()  # as if another user had made the store
+    shutil.rmtree(trust.allowed_folder())  # as if another user had made the store
     assert invoke("certify", "r.sqlite", "--kind", "audit").exit_code == 0  # runs no code
     foreign = invoke("certify", "r.sqlite", "--kind", "region")
     assert foreign.exit_code == 2
-    assert "would import or run code" in foreign.stderr
+    assert "would build its experiment" in foreign.stderr
     assert "give --trust" in foreign.stderr
     named = invoke("certify", "r.sqlite", "--kind", "region", "--experiment", "rotor.toml")
     assert named.exit_code == 0, named.output
