@@ -641,7 +641,7 @@ ATTACKS: dict[str, Callable[[], object]] = {
     "trajectory": lambda: Trajectory(TASK.times, np.zeros((26, 2)), np.zeros((25, 1)), HOSTILE),
     "truth": lambda: Truth(1.0, SPACE.parameters([1, 2, 3, 4]), HOSTILE),
     "made good": lambda: certificates.RecoveredFailure(1, 2, HOSTILE),
-    "diagnosis": lambda: certificates.Diagnosis(0.0, 1, 1.0, 1.0, HOSTILE),
+    "diagnosis": lambda: certificates.Diagnosis(0.0, 1, 1.0, 1.0, "far_task", HOSTILE),
     "manual": lambda: systems.Manual(states={"x": HOSTILE}, inputs={}, dt=1.0),
     "command": lambda: systems.Subprocess([sys.executable, HOSTILE], timeout=1.0),
     "model": lambda: models.Function(type(HOSTILE, (), {"__call__": policy})()),

@@ -44,7 +44,8 @@ def test_further_tasks_are_independent_of_trials_and_repeat() -> None:
     assert again is not None
     assert found.predicted is not None
     assert again.predicted is not None
-    drawn = [trial.number for trial in campaign.trials if trial.origin == "iid"]
+    sample = Sample.of(campaign.trials)
+    drawn = [sample.numbers[row] for row in sample.countable]
     assert (found.predicted.before, len(found.predicted.executed)) == (drawn[0], len(drawn))
     assert found.predicted.drawn.shape == (50,)
     np.testing.assert_array_equal(found.predicted.drawn, again.predicted.drawn)

@@ -55,8 +55,10 @@ def draws(
     points = np.random.default_rng(0).random((n, 1))
     sample = Sample(points, np.array(distances), ["iid"] * n, states, planned=planned or [n] * n)  # type: ignore[arg-type]
     counted = sample.countable
-    if function is None or not counted:
+    if function is None:
         return sample
+    if not counted:
+        return replace(sample, learned=Learned())
     learned = learned_by(function, points[counted], counted[0], predictions)
     return replace(sample, learned=learned)
 
