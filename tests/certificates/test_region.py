@@ -248,10 +248,8 @@ def share_above_bound(seed: int) -> float:
     certificate = verdict.certificate
     assert certificate is not None
     assert certificate.details["learned_before"] == 6
-    learned = campaign.provenance.learned
-    assert learned is not None
     points = np.linspace(0, 1, 201)[:, None]
     truth = campaign.validation.distances(campaign.validation.space.from_unit(points))
-    bound = learned.expected(points, 6) + certificate.details["margin"]
+    bound = campaign.recorder.dynamics.expected(campaign.trials, points, 6) + certificate.details["margin"]
     assert certificate.details["margin"] < 0.1 * truth.max()
     return float((truth > bound).mean() - certificate.details["volume_of_draws"])
