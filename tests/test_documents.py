@@ -191,6 +191,12 @@ def test_the_glossary_is_in_alphabetical_order() -> None:
     assert terms == sorted(terms)
 
 
+def test_the_glossary_explains_no_word_that_the_source_does_not_have() -> None:
+    source = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "src").rglob("*.py"))
+    names = {name for name in words() if re.fullmatch(r"[a-z][a-z_0-9]*", name)}
+    assert {name for name in names if not re.search(rf"\b{name}\b", source)} == set()
+
+
 def test_no_page_has_the_name_of_one_that_the_manual_makes_itself() -> None:
     assert not {path.stem for path in (ROOT / "docs").glob("*.md")} & {"search", "genindex", "py-modindex"}
 
