@@ -11,7 +11,6 @@
     ├── ExecutionError                      an execution of S failed; a campaign records it as a failed trial
     ├── DistanceError                       the distance failed or returned an unusable result
     ├── CertificateError (also ValueError)  the trials or options do not meet the assumptions of a certificate
-    │   └── NoTimeError                     ... because their evidence needs more seconds of thinking
     ├── StoreError
     │   ├── StoreAccessError                the file cannot be opened, read or written
     │   ├── ForeignStoreError               the file is not a store that this version can read
@@ -71,10 +70,6 @@ class DistanceError(CtxvalError):
 
 class CertificateError(CtxvalError, ValueError):
     """The trials or options do not meet the assumptions of a certificate."""
-
-
-class NoTimeError(CertificateError):
-    """The evidence of a certificate needs more seconds of thinking than its budget has."""
 
 
 class StoreError(CtxvalError):

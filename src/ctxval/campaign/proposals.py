@@ -129,8 +129,8 @@ class Proposals:
                     steady = DesignContinuity(self._dynamics.study.planner, lambda points: expected(points)[0])
                     costs = partial(costs_of, prediction, self._validation, trials)
                     left = remaining_tasks(self._validation, trials)
-                    known = {"costs": costs, "steady": steady, "candidates": left, "thinking": self.thinking}
-                    prediction = replace(prediction, **known)
+                    prediction = replace(prediction, costs=costs, steady=steady, candidates=left)
+                    prediction = replace(prediction, thinking=self.thinking)
                 search.use_prediction(prediction)
             point, note = self._asked()
             repeats = self._validation.space.members is None
