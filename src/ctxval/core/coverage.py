@@ -61,3 +61,19 @@ class UnsampledParameter(ShortRepr):
     gap: float  #: the largest distance of one of its values to the nearest executed one, as a share of its range
     task: Array  #: a task in that gap, a point of the unit cube ``(d,)``
     idle: bool = False  #: whether a parameter of this kind changes no predicted distance either; not of a suite
+
+
+@dataclass(frozen=True)
+class UntestedRest:
+    """The place that is farthest from all places where friction at rest was tested.
+
+    Executions test a place if a joint leaves rest there under a force that hardly exceeds the usual friction at rest.
+    """
+
+    size: float  #: distance of the nearest tested place, as a share of the range in which joints leave rest
+    place: dict[str, float]  #: the place, by the label of the joint's coordinate, in its unit
+    within: float  #: distance of the nearest tested place, in this unit
+    force: float  #: the largest force that tests a place, in the unit of the input
+    highest: float  #: the largest predicted distance if friction at rest is several times as large everywhere
+    #: tasks whose predicted runs leave rest at such a place under such a force, points of the unit cube, the best first
+    tasks: tuple[tuple[float, ...], ...] = ()
