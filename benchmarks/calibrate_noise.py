@@ -121,28 +121,29 @@ def _ranks(campaign: Campaign) -> list[float]:
     return ranks
 
 
-def table(half: str) -> str:
-    """Return the answers by imperfection, or by plant if these are misleading."""
+HEADER = (
+    *("imperfection", "at 0.95: validated (false), falsified, undecided"),
+    *("at 1.25: validated", "median executions", "at 1.1: validated"),
+)
+
+
+def rows(half: str) -> list[list[str]]:
+    """Return the answers by imperfection, or by plant if these are misleading, and the sum."""
     by = "plant" if half == "misleading" else "imperfection"
-    lines = [
-        f"| {by} | at 0.95: validated (false), falsified, undecided | at 1.25: validated of, executions "
-        "| at 1.1: validated of |",
-        "|---|---|---|---|",
-    ]
     results = [line for line in STORED.select(rule=RULE) if line["plant"] in HALVES[half]]
-    for key in dict.fromkeys(line[by] for line in results):
-        lines.append(_row(key, [line for line in results if line[by] == key]))
-    return "\n".join([*lines, _row("all", results)])
+    groups = {key: [line for line in results if line[by] == key] for key in dict.fromkeys(line[by] for line in results)}
+    return [row(name, of) for name, of in {**groups, "all": results}.items()]
 
 
-def _row(name: str, results: Iterable[dict[str, Any]]) -> str:
+def row(name: str, results: Iterable[dict[str, Any]]) -> list[str]:
+    """Return the answers and executions of campaigns."""
     of = {share: [line for line in results if line["share"] == share] for share in SHARES}
     below = [line["answer"] for line in of[0.95]]
     counts = ", ".join(str(below.count(answer)) for answer in ("validated", "falsified", "undecided"))
-    above = [line for line in of[1.25] if line["answer"] == "validated"]
-    median = f", {np.median([line['executions'] for line in above]):.0f}" if above else ""
+    above = [line["executions"] for line in of[1.25] if line["answer"] == "validated"]
     near = sum(line["answer"] == "validated" for line in of[1.1])
-    return f"| {name} | {counts} | {len(above)} of {len(of[1.25])}{median} | {near} of {len(of[1.1])} |"
+    median = f"{np.median(above):.0f}" if above else "-"
+    return [name, counts, f"{len(above)} of {len(of[1.25])}", median, f"{near} of {len(of[1.1])}"]
 
 
 def main() -> None:
@@ -167,7 +168,8 @@ def main() -> None:
         STORED.append(result)
         shown = ("plant", "imperfection", "seed", "share", "answer", "executions", "bound", "seconds")
         print(*(result[key] for key in shown), flush=True)
-    print(table(options.half))
+    for line in rows(options.half):
+        print(*line, sep=" | ")
 
 
 if __name__ == "__main__":

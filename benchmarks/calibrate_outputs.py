@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from calibrate import RESULTS, all_of
-from calibration_verdicts_part import table
 from ctxval import Campaign, Parameters, Task, Validation, controllers, systems
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
@@ -94,19 +93,18 @@ def decide(run: tuple[str, str, int, float]) -> dict[str, Any]:
     return {**key, **outcome(campaign, verdict, largest, started), "kind": kind}
 
 
-def table_text() -> str:
-    """Return how campaigns ended by imperfection, as a table in Markdown."""
-    header = ["imperfection", "at 0.95: validated (false), falsified, undecided", "at 1.25: validated", "executions"]
-    rows = list[list[str]]()
+def rows() -> list[list[str]]:
+    """Return how campaigns ended by imperfection."""
+    found = list[list[str]]()
     for imperfection in IMPERFECTIONS_TRIED:
         of = {share: STORED.select(rule=RULE, imperfection=imperfection, share=share) for share in SHARES}
         below = [line["answer"] for line in of[0.95]]
         above = [line["executions"] for line in of[1.25] if line["answer"] == "validated"]
         counts = ", ".join(str(below.count(answer)) for answer in ("validated", "falsified", "undecided"))
-        median = f"{np.median(above):.0f}" if above else ""
+        median = f"{np.median(above):.0f}" if above else "-"
         if below or of[1.25]:
-            rows.append([imperfection, counts, f"{len(above)} of {len(of[1.25])}", median])
-    return table(header, rows)
+            found.append([imperfection, counts, f"{len(above)} of {len(of[1.25])}", median])
+    return found
 
 
 def main() -> None:
@@ -124,7 +122,8 @@ def main() -> None:
         STORED.append(result)
         shown = ("plant", "imperfection", "share", "answer", "executions", "bound", "seconds")
         print(*(result[key] for key in shown), flush=True)
-    print(table_text())
+    for row in rows():
+        print(*row, sep=" | ")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 import misleading
-from calibration_page import table
+from page_tables import table
 from plants import DEVELOPMENT, REPORTING
 from search_cells import ENDS, ENDS_OF, cells, reached, results
 from study_ablations import ABLATIONS, BUDGET, CHOSEN_BY, ON_PLANTS, OTHERS

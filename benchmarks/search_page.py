@@ -17,10 +17,10 @@ import search_plants_part
 import search_speed_part
 import search_versions_part
 import study_global_search
-from calibration_page import table
 from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
 from ctxval.paper.reproduce.jobs import AUTO, measured_with
+from page_tables import table
 from peers import run
 from peers.page import first_within as within_of
 from search_ablations_part import (

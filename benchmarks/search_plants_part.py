@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration_page import table
+from page_tables import table
 from plants import PLANTS, Plant
 from plants.truths import TRUTHS
 from study_auto import Result, first_within, shown

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import statistics
 
-from calibration_page import table
 from landed import LANDED, STORED, Ratio
+from page_tables import table
 
 TEXT = """## CPU time beside an earlier revision
 

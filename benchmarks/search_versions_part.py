@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from calibration_page import table
 from landed import LANDED
+from page_tables import table
 from search_cells import ENDS, cells, results
 from study_auto import CASES, Result, first_within
 

@@ -201,27 +201,29 @@ def ranked(true: Array, drawn: Array, rng: np.random.Generator) -> list[int]:
     return [int(rank) for rank in below + rng.integers(equal + 1)]
 
 
-def row(name: str, of: str, results: Sequence[dict[str, Any]], possible: int) -> str:
-    """Return a row of the table: how often the truth is below and above all draws, and how probable that is."""
+def row(name: str, of: str, results: Sequence[dict[str, Any]], possible: int) -> list[str]:
+    """Return how often the truth is below and above all draws, and how probable that is."""
     each = np.array([result[of] for result in results])
     first = np.bincount(each[:, 0], minlength=possible)
     p_value = stats.chisquare(first.reshape(-1, 2).sum(axis=1)).pvalue
     cells = [f"{100 * part:.1f} %" for part in ((each == 0).mean(), (each == possible - 1).mean())]
     spread = ((each + 0.5) / possible).var() * 12
-    return f"| {name} | {of} | {len(results)} | {' | '.join(cells)} | {spread:.2f} | {p_value:.2g} |"
+    return [name, of, str(len(results)), *cells, f"{spread:.2f}", f"{p_value:.2g}"]
 
 
-def table(results: JsonLines, seeds: range, designs: Sequence[str] = DESIGNS, states: Sequence[int] = STATES) -> str:
+HEADER = ("transitions, states", "value", "systems", "below all draws", "above all draws", "spread", "p")
+
+
+def rows(
+    results: JsonLines, seeds: range, designs: Sequence[str] = DESIGNS, states: Sequence[int] = STATES
+) -> list[list[str]]:
     """Return the table of the ranks that are stored of these seeds."""
-    lines = [
-        "| transitions, states | value | systems | below all draws | above all draws | spread | p |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-    ]
+    found = list[list[str]]()
     for design, of in product(designs, ("residual", "distance")):
         each = {n: [one for one in results.select(design=design, states=n) if one["seed"] in seeds] for n in states}
-        lines += [row(f"{design}, {n}", of, chosen, RANKS) for n, chosen in each.items()]
-        lines.append(row(f"{design}, all", of, [one for chosen in each.values() for one in chosen], RANKS))
-    return "\n".join(lines)
+        found += [row(f"{design}, {n}", of, chosen, RANKS) for n, chosen in each.items()]
+        found.append(row(f"{design}, all", of, [one for chosen in each.values() for one in chosen], RANKS))
+    return found
 
 
 def main() -> None:
@@ -239,7 +241,8 @@ def main() -> None:
     for seed, design, states in product(seeds, options.designs, options.states):
         if (design, states, seed) not in results:
             results.append({"design": design, "states": states, "seed": seed, **ranks(design, states, seed)})
-    print(table(results, seeds, options.designs, options.states))
+    for line in rows(results, seeds, options.designs, options.states):
+        print(*line, sep=" | ")
 
 
 if __name__ == "__main__":

@@ -34,7 +34,6 @@ NAMES = ("salt-bath", "wet-surface", "spinning-tracks", "heavy-bin", "stalling-w
 TRUE, FALSE = 1.25, 0.95
 """Thresholds as shares of d*, of regular and of misleading systems."""
 SEEDS, CANDIDATES = 2, 16
-CONCLUSION = "So far nothing was gained by it, in few campaigns, and the farthest task is executed as before."
 STORED = JsonLines(RESULTS / "ranked_coverage.jsonl", ("entry", "seed", "share", "ranked"))
 
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration_page import table
 from ctxval._util.arrays import Array
 from ctxval.paper.reproduce.jobs import AUTO, measured_with
+from page_tables import table
 from peers import overhead, run
 from peers.functions import CASES, SEEDS
 from peers.methods import METHODS

@@ -209,11 +209,6 @@ def test_loggers_and_locks_are_tools_and_no_values(written: Callable[[str], Modu
     assert first_difference(before, describe(module.Rig())) is None
 
 
-def test_two_lambdas_of_one_line_are_told_apart(written: Callable[[str], ModuleType]) -> None:
-    module = written(BEFORE)
-    assert len({source_digest(module.low), source_digest(module.high)}) == 2
-
-
 def test_functions_that_call_each_other_have_a_digest(written: Callable[[str], ModuleType]) -> None:
     source = "\n".join(f"def f{i}(x): return {' + '.join(f'f{j}(x)' for j in range(30))}" for i in range(30))
     assert source_digest(written(source).f0) is not None

@@ -11,11 +11,17 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
+import calibration_page
 import compare_page
 import search_page
 import study_main_job
 import study_refine
 from peers import page as peers_page
+
+
+@pytest.mark.thorough
+def test_the_calibration_is_what_the_stored_campaigns_give() -> None:
+    assert calibration_page.page().outdated() == []
 
 
 @pytest.mark.parametrize(

@@ -325,10 +325,10 @@ def test_tasks_that_were_planned_are_not_planned_again(batched: bool) -> None:
         assert planner.has(POINTS[0])
 
 
-def test_the_oldest_plans_make_room_for_new_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_oldest_plans_make_room_for_new_ones() -> None:
     planner, synthesizer = counting(False)
     planner.plan(POINTS[:1])
-    monkeypatch.setattr(closed_loops, "_REMEMBERED", 0)
+    planner.kept_bytes = 0
     planner.plan(POINTS[1:])
     assert not planner.has(POINTS[0])
     assert synthesizer.designed >= len(POINTS)

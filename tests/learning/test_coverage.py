@@ -12,7 +12,6 @@ from ctxval._util.arrays import Array
 from ctxval.core.coverage import StateInputCoverage
 from ctxval.learning.closed_loops import LoopPlanner, Loops
 from ctxval.learning.coverage import (
-    MOST_COORDINATES,
     away_from_executions,
     largest_pocket,
     position_states,
@@ -113,9 +112,9 @@ def test_an_input_that_was_never_used_is_named() -> None:
 
 
 def test_with_many_coordinates_pairs_are_not_compared() -> None:
-    planner = make_planner(MOST_COORDINATES)
+    planner = make_planner(6)
     rng = np.random.default_rng(0)
-    posterior = learn(planner, rng.normal(size=(30, MOST_COORDINATES)), rng.normal(size=(30, 1)))
+    posterior = learn(planner, rng.normal(size=(30, 6)), rng.normal(size=(30, 1)))
     found = coverage(planner, posterior, TASKS)
     assert found.pair is None
     assert found.marginal.size > 0

@@ -15,7 +15,8 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ShapeError
 from ctxval.gp.kernels import Matern
 from ctxval.gp.regression import log_likelihood_of_outputs
-from ctxval.learning import DynamicsStudy, dynamics_study
+from ctxval.learning import DynamicsStudy
+from ctxval.learning.dynamics_study import LearningSettings
 from ctxval.learning.prediction import predict_composed
 from ctxval.paper.cases import linear
 from ctxval.searches import Prediction, TrustRegion
@@ -24,8 +25,10 @@ from rig_thorough import more
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 
 
-def predict_distance(validation: Validation, runs: list[tuple[Array, Trajectory]]) -> Prediction | None:
-    study = DynamicsStudy(validation)
+def predict_distance(
+    validation: Validation, runs: list[tuple[Array, Trajectory]], **settings: float
+) -> Prediction | None:
+    study = DynamicsStudy(validation, settings=LearningSettings(**settings))
     return study.prediction_of(study.learn(runs), runs)
 
 
@@ -138,7 +141,7 @@ def test_nothing_is_predicted_where_no_task_can_be_planned() -> None:
     assert predict_distance(validation, []) is None
 
 
-def test_slow_designs_are_spread_over_processes_and_come_out_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_designs_are_spread_over_processes_and_come_out_the_same() -> None:
     class Seen(controllers.LQR):
         batched = False
 
@@ -151,8 +154,7 @@ def test_slow_designs_are_spread_over_processes_and_come_out_the_same(monkeypatc
     validation.synthesizer = Seen([1.0, 0.1], [1e-2], [10.0, 1.0])
     results = []
     for slow in (np.inf, 0.0):
-        monkeypatch.setattr(dynamics_study, "_SLOW", slow)
-        predicted = predict_distance(validation, [])
+        predicted = predict_distance(validation, [], slow_loop=slow)
         assert predicted is not None
         before = len(designers)
         results.append(np.array(predicted.expected(points)))

@@ -12,14 +12,11 @@ import sys
 import sysconfig
 import types
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 _SKIPPED = ("ctx", "kind", "type_comment", "returns", "annotation")
 """Fields of a syntax tree that do not affect the computation."""
-
-_Function = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 
 
 class _Global(NamedTuple):
@@ -30,7 +27,7 @@ class _Global(NamedTuple):
 
 
 def source_digest(value: Any) -> str | None:
-    """Return a digest of the source of all functions, classes and constants of users that an object reaches.
+    """Return a digest of the top-level statements of users' modules that define an object, and what these use.
 
     They are reached by names, closures, attributes and base classes. No value is part of the digest, because it may be
     a secret. Returns None if the object reaches none, for example if it belongs to a library.
@@ -88,36 +85,31 @@ def enclosed(function: types.FunctionType) -> list[Any]:
 
 
 def _source_and_uses(item: Any) -> tuple[list[str], list[Any]]:
-    """Return the digests of what an object is made of, if that is source of users, and the objects that it uses."""
+    """Return the digests of the statements that define an object, if they are users', and the objects that it uses."""
     match item:
         case _Global(module, name):
-            known = _read(None if is_library(module) else getattr(module, "__file__", None))
-            body = known.assigned.get(name, [])
-            used = [vars(module)[name], *known.imported(item), *_globals(module, _loaded(body))]
-            return [_hashed(_plain(node)) for node in body], used
+            source = _read(None if is_library(module) else getattr(module, "__file__", None))
+            digests, used = _of_statements(module, source.assigned.get(name, []))
+            return digests, [vars(module)[name], *source.imported(item), *used]
         case functools.partial():
             return [], [item.func, *item.args, *item.keywords.values()]
         case types.MethodType():
             return [], [item.__func__, item.__self__]
-        case types.FunctionType():
-            used = [*enclosed(item), *(item.__defaults__ or ()), *(item.__kwdefaults__ or {}).values()]
+        case types.FunctionType(__code__=code):
+            values = [*enclosed(item), *(item.__defaults__ or ()), *(item.__kwdefaults__ or {}).values()]
             if is_library(item):
-                return [], used
-            node = _function_node(item.__code__)
+                return [], values
+            around = [each for each in _read(code.co_filename).body if code.co_firstlineno in _lines(each)]
+            digests, used = _of_statements(sys.modules.get(item.__module__), around)
             # Without source, its constants are its identity, because instructions differ between versions of Python.
-            digest = _constants(item.__code__) if node is None else _hashed(_plain(node, top=True))
-            return [digest], used + _globals(sys.modules.get(item.__module__), _names(item.__code__))
+            return digests or [_constants(code)], [*values, *used]
+        case type() if is_library(item):
+            return [], []
         case type():
-            if is_library(item):
-                return [], []
-            functions = [function for member in vars(item).values() for function in _functions_in(member)]
-            home = sys.modules.get(item.__module__)
-            tree = _read(getattr(home, "__file__", None)).classes.get(item.__qualname__)
-            if tree is None:
-                return [""], [*item.__bases__, *functions]
-            # The functions of the class without generated ones, and the definitions that its body uses.
-            written = [function for function in functions if not function.__code__.co_filename.startswith("<")]
-            return [_hashed(_plain(tree, top=True))], [*item.__bases__, *written, *_globals(home, _loaded([tree]))]
+            home, name = sys.modules.get(item.__module__), item.__qualname__.partition(".")[0]
+            body = _read(getattr(home, "__file__", None)).body
+            digests, used = _of_statements(home, [each for each in body if getattr(each, "name", None) == name])
+            return digests or [""], used or [*item.__bases__, *filter(inspect.isfunction, vars(item).values())]
         case types.ModuleType():
             return [], []
     if type(item) in (list, tuple, dict):
@@ -131,54 +123,39 @@ def _source_and_uses(item: Any) -> tuple[list[str], list[Any]]:
     return [], [type(item), *attributes.values()]
 
 
-def _functions_in(member: Any) -> list[types.FunctionType]:
-    """Return the Python functions of a class attribute: a method, the functions of a property, wrapped functions."""
-    inner = (getattr(member, name, None) for name in ("fget", "fset", "__func__", "func", "__wrapped__"))
-    functions = [function for wrapped in inner if callable(wrapped) for function in _functions_in(wrapped)]
-    return [member, *functions] if isinstance(member, types.FunctionType) else functions
+def _of_statements(module: types.ModuleType | None, statements: Iterable[ast.stmt]) -> tuple[list[str], list[Any]]:
+    """Return digests of statements in a module, and the definitions that they use there and in users' modules."""
+    listed, known = list(statements), {} if module is None else vars(module)
+    nodes = [node for each in listed for node in ast.walk(each)]
+    names = {node.id for node in nodes if isinstance(node, ast.Name)}
+    names |= {node.attr for node in nodes if isinstance(node, ast.Attribute)}
+    used = [_Global(module, name) for name in sorted(names & known.keys()) if module is not None]
+    for inner in (known[each.name] for each in list(used)):
+        if inspect.ismodule(inner) and not is_library(inner):
+            used += [_Global(inner, name) for name in sorted(names & vars(inner).keys())]
+    return [_hashed(_plain(each)) for each in listed], used
 
 
-def _globals(module: types.ModuleType | None, names: set[str]) -> list[_Global]:
-    """Return the definitions behind the names that source in a module uses, also those in users' modules."""
-    if module is None:
-        return []
-    used = [_Global(module, name) for name in sorted(names & vars(module).keys())]
-    values = (vars(module)[item.name] for item in used)
-    modules = [value for value in values if inspect.ismodule(value) and not is_library(value)]
-    return [*used, *(_Global(inner, name) for inner in modules for name in sorted(names & vars(inner).keys()))]
-
-
-def _names(code: types.CodeType) -> set[str]:
-    inner = (_names(item) for item in code.co_consts if isinstance(item, types.CodeType))
-    return set(code.co_names).union(*inner)
-
-
-def _loaded(nodes: Iterable[ast.AST]) -> set[str]:
-    names: set[str] = set()
-    for node in nodes:
-        match node:
-            case ast.Name(id=name) | ast.Attribute(attr=name):
-                names.add(name)
-        names |= _loaded(child for child in ast.iter_child_nodes(node) if not isinstance(child, _Function))
-    return names
+def _lines(statement: ast.stmt) -> range:
+    first = min(each.lineno for each in (statement, *getattr(statement, "decorator_list", ())))
+    return range(first, (statement.end_lineno or first) + 1)
 
 
 def _constants(code: types.CodeType) -> str:
-    constants = [
-        _constants(item)
-        if isinstance(item, types.CodeType)
-        else repr(sorted(map(repr, item)) if isinstance(item, frozenset) else item)
-        for item in code.co_consts
-    ]
-    return _hashed((code.co_names, constants))
+    def text(each: Any) -> str:
+        if isinstance(each, types.CodeType):
+            return _constants(each)
+        return repr(sorted(map(repr, each)) if isinstance(each, frozenset) else each)
+
+    return _hashed((code.co_names, [text(each) for each in code.co_consts]))
 
 
-@dataclass
-class _Source:
-    functions: dict[str, list[_Function]] = field(default_factory=dict)
-    classes: dict[str, ast.AST] = field(default_factory=dict)
-    assigned: dict[str, list[ast.stmt]] = field(default_factory=dict)
-    imports: dict[str, tuple[str, str]] = field(default_factory=dict)
+class _Source(NamedTuple):
+    """The statements of a module, those that assign a name, and where names are imported from."""
+
+    body: list[ast.stmt]
+    assigned: dict[str, list[ast.stmt]]
+    imports: dict[str, tuple[str, str]]
 
     def imported(self, item: _Global) -> list[_Global]:
         source, name = self.imports.get(item.name, ("", ""))
@@ -189,64 +166,27 @@ class _Source:
 
 def _read(file: str | None) -> _Source:
     if file is None:
-        return _Source()
+        return _Source([], {}, {})
     linecache.checkcache(file)
     return _parsed("".join(linecache.getlines(file)))
 
 
 @functools.lru_cache(maxsize=64)
-def _parsed(source: str) -> _Source:
-    definitions = _Source()
+def _parsed(text: str) -> _Source:
+    source = _Source([], {}, {})
     try:
-        tree = ast.parse(source)
+        source.body.extend(ast.parse(text).body)
     except (SyntaxError, ValueError, RecursionError):
-        return definitions
-
-    def visit(parent: ast.AST, path: str) -> None:
-        for node in ast.iter_child_nodes(parent):
-            inside = path
-            match node:
-                case ast.ClassDef(name=name):
-                    definitions.classes[f"{path}{name}"] = node
-                    inside = f"{path}{name}."
-                case ast.Lambda():
-                    definitions.functions.setdefault("<lambda>", []).append(node)
-                case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name):
-                    definitions.functions.setdefault(name, []).append(node)
-                    inside = f"{path}{name}.<locals>."
-                case ast.ImportFrom(names=names):
-                    place = "." * node.level + (node.module or "")
-                    definitions.imports.update((alias.asname or alias.name, (place, alias.name)) for alias in names)
-            visit(node, inside)
-
-    visit(tree, "")
-    for statement in tree.body:
-        for part in ast.walk(statement):
-            match statement, part:
+        return source
+    for statement in source.body:
+        for node in ast.walk(statement):
+            match statement, node:
                 case ast.Assign() | ast.AnnAssign() | ast.AugAssign(), ast.Name(id=name, ctx=ast.Store()):
-                    definitions.assigned.setdefault(name, []).append(statement)
-    return definitions
-
-
-def _function_node(code: types.CodeType) -> ast.AST | None:
-    matching = []
-    for node in _read(code.co_filename).functions.get(code.co_name, ()):
-        if isinstance(node, ast.Lambda):
-            matches = all(_covers(node.body, place) for place in code.co_positions())
-        else:
-            matches = code.co_firstlineno == min(part.lineno for part in (node, *node.decorator_list))
-        if matches:
-            matching.append(node)
-    return min(matching, key=lambda node: sum(1 for _ in ast.walk(node)), default=None)
-
-
-def _covers(node: ast.expr, place: tuple[int | None, int | None, int | None, int | None]) -> bool:
-    match place:
-        # An instruction at one place was added by the compiler, such as the one at the start of a function.
-        case (int(line), int(last_line), int(column), int(last)) if (line, column) != (last_line, last):
-            end = (node.end_lineno or 0, node.end_col_offset or 0)
-            return (node.lineno, node.col_offset) <= (line, column) and (last_line, last) <= end
-    return True
+                    source.assigned.setdefault(name, []).append(statement)
+                case _, ast.ImportFrom(names=names):
+                    place = "." * node.level + (node.module or "")
+                    source.imports.update((alias.asname or alias.name, (place, alias.name)) for alias in names)
+    return source
 
 
 def _is_text(node: ast.AST) -> bool:
@@ -258,7 +198,7 @@ def _hashed(tree: Any) -> str:
     return hashlib.sha256(repr(tree).encode()).hexdigest()[:16]
 
 
-def _plain(node: Any, *, top: bool = False, bare: bool = False) -> Any:
+def _plain(node: Any, *, bare: bool = False) -> Any:
     """Return a tree as tuples without docstrings, bare also without imports and texts that stand alone.
 
     Empty fields are left out, so that every version of Python gives the same tuples.
@@ -273,7 +213,7 @@ def _plain(node: Any, *, top: bool = False, bare: bool = False) -> Any:
         if bare and isinstance(value, list):
             value = [part for part in value if not (isinstance(part, ast.Import | ast.ImportFrom) or _is_text(part))]
         empty = value == [] or (value is None and not isinstance(node, ast.Constant))
-        if empty or name in _SKIPPED or (top and name == "name"):
+        if empty or name in _SKIPPED:
             continue
         if documented and name == "body" and _is_text(value[0]):
             value = value[1:]

@@ -28,7 +28,6 @@ T = TypeVar("T")
 AnyPosterior = DynamicsPosterior | NoisyPosterior  # of dynamics without and with noise
 
 _UNITS = "closed loops", "designs", "tasks"  # of stages that closed loops are progress of
-_REMEMBERED = 64_000_000  # largest size of the plans that are kept, in bytes, approximately
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +52,12 @@ class Loops:
 class LoopPlanner:
     """Designs controllers for points of the unit cube, and runs drawn systems in closed loop with them.
 
-    The latest plans are kept. Tasks that are planned together are kept together, because a controller of a batch need
-    not have parts; they are found again if the same points are asked for in the same order.
+    The latest plans are kept, up to about ``kept_bytes``. Tasks that are planned together are kept together, because a
+    controller of a batch need not have parts; they are found again if the same points are asked for in the same order.
     """
 
-    def __init__(self, validation: Validation) -> None:
-        self.validation = validation
+    def __init__(self, validation: Validation, kept_bytes: int = 64_000_000) -> None:
+        self.validation, self.kept_bytes = validation, kept_bytes
         self._together: bool | None = None
         self._kept: OrderedDict[bytes, tuple[list[PlannedTasks], int]] = OrderedDict()
         self._size = 0
@@ -92,7 +91,7 @@ class LoopPlanner:
                 needed = sum(2 * (x.nbytes + u.nbytes) + int(x.shape[-1]) * u.nbytes for x, u in arrays) + len(key)
                 self._kept[key] = planned, needed
                 self._size += needed
-                while self._size > _REMEMBERED:
+                while self._size > self.kept_bytes:
                     self._size -= self._kept.popitem(last=False)[1][1]
             advance(len(some), units=_UNITS)  # as if those that are kept were planned again
             plans += [replace(plan, rows=first + plan.rows) for plan in planned]

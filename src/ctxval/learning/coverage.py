@@ -20,12 +20,6 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import Loops, PlannedTasks
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
-MOST_COORDINATES = 6
-"""Largest number of state-input coordinates for which pairs of coordinates are compared."""
-_MOSTLY = [1e-3, 1 - 1e-3]  # quantiles of what is visited that are its range
-_FLAT = 0.1  # largest share of its longer side of a region that is a line rather than a plane
-_FARTHEST = 1e3  # standardised coordinates are limited to this magnitude
-
 
 def coverage(
     posterior: DynamicsPosterior,
@@ -33,13 +27,14 @@ def coverage(
     planned: Sequence[PlannedTasks],
     loops: Sequence[Loops],
     labels: Sequence[str],
+    most_coordinates: int = 6,
 ) -> StateInputCoverage:
     """Return how well the records cover the closed loops of tasks ``(q, d)`` on the posterior mean.
 
-    States and inputs have these labels.
+    States and inputs have these labels. With more coordinates than the largest number, pairs are not compared.
     """
     visited, rows = _visited(posterior, loops), np.concatenate([tasks.rows for tasks in planned])
-    width = np.maximum(np.ptp(np.quantile(visited, _MOSTLY, axis=(0, 1)), axis=0), 1e-9)
+    width = np.maximum(np.ptp(_ends(visited, (0, 1)), axis=0), 1e-9)
     recorded, scaled = posterior.data.recorded / width, visited / width
     beyond = _beyond(recorded, scaled)
     # Gaps between the records are looked for in a part of the tasks and of the steps.
@@ -50,7 +45,7 @@ def coverage(
         above = np.clip(np.searchsorted(ordered, some[..., i]), 1, len(ordered) - 1)
         gaps[..., i] = np.minimum(np.abs(some[..., i] - ordered[above]), np.abs(some[..., i] - ordered[above - 1]))
     pairs, couples = None, list(map(list, combinations(range(len(width)), 2)))
-    if len(width) <= MOST_COORDINATES:
+    if len(width) <= most_coordinates:
         trees = [(cKDTree(recorded[:, two]), two) for two in couples]
         pairs = np.stack([tree.query(some[..., two], p=np.inf)[0] for tree, two in trees], axis=-1)
     # What is beyond all records weighs ten times as much as a gap in one coordinate, and a gap in two of them less.
@@ -84,8 +79,7 @@ def beyond_records(
     Each array has a number for each task, in the order of the loops. With ``executed_only``, the data that M was made
     from are no records.
     """
-    ends = np.quantile(_visited(posterior, of_pool), _MOSTLY, axis=(0, 1))
-    width = np.maximum(np.ptp(ends, axis=0), 1e-9)
+    width = np.maximum(np.ptp(_ends(_visited(posterior, of_pool), (0, 1)), axis=0), 1e-9)
     data = posterior.data
     recorded = (data.recorded[data.executed] if executed_only else data.recorded) / width
     return [_beyond(recorded, _visited(posterior, [each]) / width).max(axis=(1, 2)) for each in loops]
@@ -101,8 +95,17 @@ def _visited(posterior: DynamicsPosterior, loops: Sequence[Loops]) -> Array:
     parts = [posterior.data.standardised(loop.states[0][:, :-1], loop.inputs[0]) for loop in loops]
     horizon = max(part.shape[1] for part in parts)
     longest = [np.pad(part, ((0, 0), (0, horizon - part.shape[1]), (0, 0)), mode="edge") for part in parts]
-    visited = np.nan_to_num(np.concatenate(longest), nan=_FARTHEST, posinf=_FARTHEST, neginf=-_FARTHEST)
-    return np.clip(visited, -_FARTHEST, _FARTHEST)
+    return np.clip(_finite(np.concatenate(longest)), -1e3, 1e3)
+
+
+def _finite(values: Array) -> Array:
+    """Return values with large finite numbers in the place of those of loops that diverge."""
+    return np.nan_to_num(values, nan=1e3, posinf=1e3, neginf=-1e3)
+
+
+def _ends(visited: Array, axis: int | tuple[int, int]) -> Array:
+    """Return the range of visited values, without one in a thousand on each side, shape ``(2, ...)``."""
+    return np.asarray(np.quantile(visited, [1e-3, 1 - 1e-3], axis=axis))
 
 
 def _some(count: int, most: int) -> Rows:
@@ -134,7 +137,7 @@ def largest_pocket(
         of_task, tasks: of each visited state, the row of its task ``(N,)``, and these tasks, points of the unit cube
             ``(q, d)``; only needed if there are positions.
     """
-    low, high = np.quantile(visited, _MOSTLY, axis=0)
+    low, high = _ends(visited, 0)
     rows = np.flatnonzero(((visited >= low) & (visited <= high)).all(axis=1))
     if not executed or not len(rows):
         return None
@@ -183,13 +186,12 @@ def away_from_executions(
         return away
     entered = _entered(executed)
     visited = np.concatenate([each.states[0].reshape(-1, entered.shape[1]) for each in of_pool])
-    widths = np.ptp(np.quantile(visited[np.isfinite(visited).all(axis=1)], _MOSTLY, axis=0), axis=0)
+    widths = np.ptp(_ends(visited[np.isfinite(visited).all(axis=1)], 0), axis=0)
     for two in map(list, positions):
         scale = max(float(widths[two].max()), 1e-9)
         tree = cKDTree(entered[:, two] / scale)
         for k, each in enumerate(loops):
-            places = np.nan_to_num(each.states[0][..., two] / scale, nan=_FARTHEST, posinf=_FARTHEST, neginf=-_FARTHEST)
-            away[k] = np.maximum(away[k], tree.query(places)[0].max(axis=1))
+            away[k] = np.maximum(away[k], tree.query(_finite(each.states[0][..., two] / scale))[0].max(axis=1))
     return away
 
 
@@ -239,7 +241,7 @@ def position_states(
     for two in map(list, combinations(range(len(labels)), 2)):
         if are_coordinates_of_ground(*(labels[state] for state in two)):
             spreads = [np.linalg.svd(end[:, two] - end[:, two].mean(axis=0), compute_uv=False) for end in ends]
-            if any(small > _FLAT * large for large, small in spreads):
+            if any(small > 0.1 * large for large, small in spreads):  # a plane rather than a line
                 groups.append(two)
     return groups
 

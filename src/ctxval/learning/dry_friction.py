@@ -26,20 +26,30 @@ from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.models.increments import standard_deviations
 
-_TIMES = 2  # the residual is evaluated at forces that follow from it
-_SWEEPS = 4  # each time, of the inputs, whose frictions act on each other's rates
-_EXPLAINED = 0.7  # share of the squared residuals, beside a linear function, that must be left at most
-_REST = 0.05  # share of the root mean square of a rate below which the joint is at rest
-_STILL = 0.2 * _REST  # the same, of a joint that is held; one that stops is faster
-_ERRORS = 3.0  # median errors of forces by which the bounds of what holds a joint are apart from what was seen
-_PER_COEFFICIENT = 5  # fewest recorded steps for each coefficient of the linear function
-_SLOW = np.geomspace(_REST, 0.25, 11)  # rates up to which friction is larger, as shares like _REST
-_KNOWN = 0.1  # least share of the squares of inputs that no linear function of the state has, to know what inputs do
-_LITTLE = 0.05  # share of a force up to which it counts as withstood
-_NEWTON = 4  # steps to the forces that recorded steps had
-_SLIPS = 3  # times that the friction of a joint that slips follows from its rate
-_INTEGRAL = 0.99  # least correlation of a rate with the changes of its integral
-_LARGER = 0.5  # share of the squared residuals that must be left at most if friction has one more shape
+
+@dataclass(frozen=True)
+class FrictionSettings:
+    """When friction explains what M misses, and how exactly its force is computed.
+
+    Shares of rates are those of their root mean squares.
+    """
+
+    explained: float = 0.7  # share of the squared residuals, beside a linear function, that must be left at most
+    better_shape: float = 0.5  # the same, if friction has one more shape
+    per_coefficient: int = 5  # fewest recorded steps for each coefficient of the linear function
+    varied: float = 0.1  # least share of the squares of inputs that no linear function of the state has
+    at_rest: float = 0.05  # share of a rate below which the joint is at rest
+    held: float = 0.2  # share of at_rest below which a joint is held; one that stops is faster
+    fast: float = 0.25  # share of a rate from which on friction is not larger than at high rates
+    errors: float = (
+        3.0  # median errors of forces by which the bounds of what holds a joint are apart from what was seen
+    )
+    withstood: float = 0.05  # share of a force up to which it counts as withstood
+    rounds: int = 2  # the residual is evaluated at forces that follow from it
+    sweeps: int = 4  # each time, of the inputs, whose frictions act on each other's rates
+    slips: int = 3  # times that the friction of a joint that slips follows from its rate
+    integral: float = 0.99  # least correlation of a rate with the changes of its integral
+    newton_steps: int = 4  # steps to the forces that recorded steps had
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +79,7 @@ class DryFriction:
     still: Array  # the largest rate of a joint at rest (m,)
     rest: Array  # the largest friction at rest against pushes below and above 0 (2, m), or of draws (S, 1, 2, m)
     passed: Array  # the largest friction that holds a joint as it turns (m,)
+    settings: FrictionSettings = FrictionSettings()
 
     def __getitem__(self, rows: ArrayLike) -> DryFriction:
         """Return the frictions of some draws."""
@@ -82,7 +93,7 @@ class DryFriction:
         """Return the next states ``(..., n)`` if M misses ``missed(acting inputs)``, which has their shape."""
         reached, effects = _reached(self.model, x, u, self.change)
         force, residuals = np.zeros_like(u), np.zeros_like(reached)
-        for _ in range(_TIMES):  # what is missed depends on the force, which it changes little
+        for _ in range(self.settings.rounds):  # what is missed depends on the force, which it changes little
             force = self._force(x, u, reached + residuals, effects, force)
             residuals = missed(u - force)
         force = self._force(x, u, reached + residuals, effects, force)
@@ -94,14 +105,14 @@ class DryFriction:
         before = x[..., self.rates]
         with np.errstate(all="ignore"):  # states of draws that diverge
             at_first = self._limits(u, before, before)
-            for j in [*range(m)] * (_SWEEPS if m > 1 else 1):  # projected Gauss-Seidel
+            for j in [*range(m)] * (self.settings.sweeps if m > 1 else 1):  # projected Gauss-Seidel
                 own, limit = of_rates[..., j, j], at_first[..., j]
                 rate = reached[..., self.rates[j]] - (of_rates[..., j, :] * force).sum(axis=-1)
                 free = rate + own * force[..., j]
                 stopping = np.nan_to_num(free / (own + np.sign(own) * self.creep[j]))
                 if self.excess[j]:
                     slips, after = np.abs(stopping) > limit, before.copy()
-                    for _ in range(_SLIPS):
+                    for _ in range(self.settings.slips):
                         after[..., j] = free - own * np.clip(stopping, -limit, limit)
                         limit = np.where(slips, self._limits(u, before, after)[..., j], limit)
                 # A joint at rest, or one that turns, is held if friction withstands what acts on it then.
@@ -133,21 +144,21 @@ class DryFriction:
         def rates_with(forces: Array) -> Array:
             return np.asarray((reached + missed(u - forces))[:, self.rates] - (of_rates * forces[:, None]).sum(axis=2))
 
-        for _ in range(_NEWTON):  # the frictions that these steps had
+        for _ in range(self.settings.newton_steps):  # the frictions that these steps had
             force += (inverse * (rates_with(force) - after)[:, None]).sum(axis=2)
         if errors is None:
-            moves = _directions(transitions, self.rates)
+            moves = _directions(transitions, self.rates, self.settings)
             wrong = np.abs(force - self._limits(u, before, after) * moves)[(moves != 0).all(axis=1)]
-            errors = _ERRORS * np.median(wrong, axis=0)
+            errors = self.settings.errors * np.median(wrong, axis=0)
         holding = np.repeat(force[None], m, axis=0)  # what would have kept each joint at its rate
         for j in range(m):
             holding[j, :, j] += (after - before)[:, j] / of_rates[:, j, j]
-            for _ in range(_NEWTON):
+            for _ in range(self.settings.newton_steps):
                 holding[j, :, j] += (rates_with(holding[j]) - before)[:, j] / of_rates[:, j, j]
         held = np.stack([holding[j, :, j] for j in range(m)], axis=1)
         withstood, own = np.abs(held) - self.load * np.abs(u), np.abs(np.diagonal(of_rates, axis1=1, axis2=2))
         # A held joint creeps, and rates below what little of the force changes cannot be told apart.
-        little, creeping = np.maximum(errors, _LITTLE * withstood) * own, self.creep * withstood
+        little, creeping = np.maximum(errors, self.settings.withstood * withstood) * own, self.creep * withstood
         slow, first, last = np.maximum(little, 2 * creeping), np.abs(before), np.abs(after)
         return Pushes(
             withstood,
@@ -191,18 +202,20 @@ class DryFriction:
             products = (changes * mean[:, None]).sum(axis=0)
             like = np.abs(products) / np.maximum(np.linalg.norm(changes, axis=0) * np.linalg.norm(mean), 1e-300)
             like[self.rates] = 0.0
-            found.append(int(like.argmax()) if like.max() > _INTEGRAL else None)
+            found.append(int(like.argmax()) if like.max() > self.settings.integral else None)
         return found
 
     def acting(self, transitions: Transitions) -> tuple[Transitions, Mask]:
         """Return transitions with the inputs that act, and of which the friction is known ``(N,)``: all joints move."""
-        directions = _directions(transitions, self.rates)
+        directions = _directions(transitions, self.rates, self.settings)
         limits = self._limits(transitions.u, transitions.x[:, self.rates], transitions.x_next[:, self.rates])
         acting = transitions.u - limits * directions
         return replace(transitions, u=acting), (directions != 0).all(axis=1)
 
 
-def found_friction(model: Model, transitions: Transitions) -> DryFriction | None:
+def found_friction(
+    model: Model, transitions: Transitions, settings: FrictionSettings = FrictionSettings()
+) -> DryFriction | None:
     """Return M with the friction that explains transitions best; None if friction does not explain much of them.
 
     It is estimated beside a linear function of state and input and drag, because M may be wrong in other ways, too.
@@ -214,13 +227,13 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
     reached, effects = _reached(model, x, u, 1e-3 * ranges)
     strength = np.sqrt((effects**2).mean(axis=0)) / standard_deviations(transitions.x_next - x)[:, None]
     rates = strength.argmax(axis=0)
-    directions = _directions(transitions, rates)
+    directions = _directions(transitions, rates, settings)
     moving = (directions != 0).all(axis=1)
     usual = np.sqrt((transitions.x_next[:, rates] ** 2).mean(axis=0))
     fast = x[:, rates] / np.maximum(usual, 1e-300)
     plain = [np.ones(len(x)), x / standard_deviations(x)]
     features = np.column_stack([*plain, fast * np.abs(fast), u / ranges])[moving]
-    if len(set(rates.tolist())) < len(rates) or len(features) < _PER_COEFFICIENT * features.shape[1]:
+    if len(set(rates.tolist())) < len(rates) or len(features) < settings.per_coefficient * features.shape[1]:
         return None
     residuals, of_rates = (transitions.x_next - reached)[moving][:, rates], effects[moving][:, rates]
     sizes = np.sqrt((residuals**2).mean(axis=0))
@@ -230,7 +243,7 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
     before, after = x[moving][:, rates], transitions.x_next[moving][:, rates]
     linear, by_state = np.linalg.qr(features)[0], np.linalg.qr(features[:, :-m])[0]
     # Under feedback with fixed gains, what inputs change cannot be told from what states do.
-    known = ((_beside(by_state, inputs) ** 2).sum(axis=0) > _KNOWN * (inputs**2).sum(axis=0)).all()
+    known = ((_beside(by_state, inputs) ** 2).sum(axis=0) > settings.varied * (inputs**2).sum(axis=0)).all()
     left = _beside(linear, residuals / sizes)
 
     def fitted(shapes: Sequence[Array]) -> tuple[float, Array]:
@@ -252,19 +265,20 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
 
     moves = directions[moving]
     left_over, largest = fitted([moves])
-    if not left_over**2 < _EXPLAINED * (left**2).sum():
+    if not left_over**2 < settings.explained * (left**2).sum():
         return None
     shapes = [moves, moves * np.abs(u[moving])]
     loaded, by_load = fitted(shapes)
-    if grows := loaded**2 < _LARGER * left_over**2:
+    if grows := loaded**2 < settings.better_shape * left_over**2:
         left_over, largest = loaded, by_load
     shapes = shapes if grows else [moves]
-    slowed = {slow: fitted([*shapes, moves * _slowness(before, after, slow * usual)]) for slow in _SLOW.tolist()}
+    slow_rates = np.geomspace(settings.at_rest, settings.fast, 11).tolist()
+    slowed = {slow: fitted([*shapes, moves * _slowness(before, after, slow * usual)]) for slow in slow_rates}
     slow = min(slowed, key=lambda each: slowed[each][0])
-    if falls := slowed[slow][0] ** 2 < _LARGER * left_over**2:
+    if falls := slowed[slow][0] ** 2 < settings.better_shape * left_over**2:
         largest = slowed[slow][1]
     load, excess = largest[1] if grows else np.zeros(m), largest[-1] if falls else np.zeros(m)
-    still = _STILL * usual
+    still = settings.held * settings.at_rest * usual
     return DryFriction(
         model,
         rates,
@@ -277,6 +291,7 @@ def found_friction(model: Model, transitions: Transitions) -> DryFriction | None
         still,
         rest=np.stack([largest[0] + excess] * 2),
         passed=np.full(m, np.inf),
+        settings=settings,
     )
 
 
@@ -303,10 +318,10 @@ def _creep(transitions: Transitions, reached: Array, effects: Array, rates: Rows
     return np.asarray(np.maximum(np.where(held, force * after, 0.0).sum(axis=0) / np.maximum(squares, 1e-300), 0.0))
 
 
-def _directions(transitions: Transitions, rates: Rows) -> Array:
+def _directions(transitions: Transitions, rates: Rows, settings: FrictionSettings) -> Array:
     """Return in which directions rates move ``(N, m)``, 1 or -1; 0 if a joint is nearly at rest, or turns."""
     before, after = transitions.x[:, rates], transitions.x_next[:, rates]
-    still = _REST * np.sqrt((after**2).mean(axis=0))
+    still = settings.at_rest * np.sqrt((after**2).mean(axis=0))
     moves = (np.minimum(np.abs(before), np.abs(after)) > still) & (before * after > 0)
     return np.where(moves, np.sign(after), 0.0)
 

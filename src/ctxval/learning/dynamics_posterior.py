@@ -35,8 +35,6 @@ from ctxval.learning.hyperparameters import (
 from ctxval.learning.kernel_expansion import Component, KernelExpansion, draw_functions, joined
 from ctxval.learning.residual_data import ResidualData, residual_data, smoother_than
 
-_PIVOT = 0.1  # variance, as a share of the noise, below which a transition adds nothing to those chosen before it
-
 
 @dataclass(frozen=True)
 class PosteriorSettings:
@@ -46,6 +44,7 @@ class PosteriorSettings:
     functions: int = 2  # number of functions that are drawn for each of them
     learned_from: int = 120  # number of transitions that the hyperparameters are learned from
     centres: int = 400  # largest number of transitions that each process is conditioned on
+    least_variance: float = 0.1  # share of the noise below which a transition's variance given the chosen adds nothing
     pivots: int = 100  # largest number of pairs at which a draw is exact
     families: tuple[tuple[float, float], ...] = FAMILIES  # smoothness and growth of each family of covariances
     of_steps: bool = True  # whether the system may be learned without M, if M is rougher than the system
@@ -113,9 +112,10 @@ class DynamicsPosterior(ShortRepr):
     @functools.cached_property
     def rows(self) -> Rows:
         """The transitions that represent the others for the most probable hyperparameters, by their variance."""
-        most, count = self._rescaled(self.covariances.posterior.mode), self.covariances.settings.centres
+        most, settings = self._rescaled(self.covariances.posterior.mode), self.covariances.settings
+        least = settings.least_variance * most.noise
         with single_threaded():
-            return pivoted_rows(most.kernel, most.theta, self.data.pairs, count, least=_PIVOT * most.noise)
+            return pivoted_rows(most.kernel, most.theta, self.data.pairs, settings.centres, least=least)
 
     def _component(self, drawn: ResidualHyperparameters, rng: np.random.Generator) -> Component:
         with single_threaded():
@@ -168,7 +168,7 @@ class DynamicsPosterior(ShortRepr):
         some = unused[np.linspace(0, max(0, len(unused) - 1), min(600, len(unused))).astype(int)]
         with single_threaded():
             # Up to 100 other transitions replace those that are left out.
-            least = _PIVOT * most.noise
+            least = self.covariances.settings.least_variance * most.noise
             spare = pivoted_rows(most.kernel, most.theta, self.data.pairs[some], 100, least=least)
             rows = np.concatenate([self.rows, some[spare]])
             Z, Y = self._known(rows)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.actuators import found_actuator
 from ctxval.learning.closed_loops import LoopPlanner, unseen_parameters
-from ctxval.learning.dry_friction import DryFriction, found_friction
+from ctxval.learning.dry_friction import DryFriction, FrictionSettings, found_friction
 from ctxval.learning.dynamics_posterior import LearnedCovariances, PosteriorSettings, condition, learn_covariances
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
@@ -35,15 +35,21 @@ from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
 from ctxval.systems.actuator import Actuator
 
-_FEWEST_TOLD = 6  # executions from which on a task parameter is suspected of changing the dynamics
-_FEWEST_AGAINST = 3  # executions from which on the data that M was made from may be left out
-_FEWEST_HELD = 4  # executions from which on dry friction is looked for
-_WELL = 0.1  # left-out error below which neither these data nor task parameters are asked about
-_CLEARLY = 3.0  # factor by which predictions must err less without these data, or with a parameter, and err little
-_HALF = 0.5  # share of the left-out error of rates that dry friction must leave at most
-_KEPT = 2.0  # the same, of friction that was found before: single steps tell less of it than closed loops do
-_NOISE = 0.75  # largest share of the squares of these errors that counts as noise
-_SLOW = 0.02  # seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores
+
+@dataclass(frozen=True)
+class LearningSettings:
+    """How many executions, and how much smaller errors of left-out ones, show that the dynamics have a further part."""
+
+    small_error: float = 0.1  # left-out error below which no further part is looked for
+    clear_factor: float = 3.0  # by which errors must fall without M's data, or with a task parameter, to be small
+    actuator_from: int = 3  # executions from which on delays, and wrong data that M was made from, are looked for
+    friction_from: int = 4  # executions from which on dry friction is looked for
+    parameter_from: int = 6  # executions from which on a task parameter is suspected of changing the dynamics
+    friction_share: float = 0.5  # share of the left-out error of rates that dry friction must leave at most
+    kept_share: float = 2.0  # the same, of friction that was found before: single steps tell less of it than loops do
+    noise_share: float = 0.75  # largest share of the squares of these errors that counts as noise
+    slow_loop: float = 0.02  # seconds of a closed loop on M from which on loops are distributed over the cores
+    friction: FrictionSettings = field(default_factory=FrictionSettings)
 
 
 class DynamicsStudy(ShortRepr):
@@ -58,6 +64,7 @@ class DynamicsStudy(ShortRepr):
         quantile: the share of the executions of a task that a distance is about, if the system is noisy.
         actuator: how the m inputs act; None if they act at once.
         friction: M with the dry friction that it lacks, of which the residual is learned; None without.
+        settings: the numbers that decide what is learned.
     """
 
     def __init__(
@@ -67,7 +74,9 @@ class DynamicsStudy(ShortRepr):
         quantile: float = QUANTILE,
         extended: ExtendedValidation | None = None,
         friction: DryFriction | None = None,
+        settings: LearningSettings = LearningSettings(),
     ) -> None:
+        self.settings = settings
         self.given, self.seed, self.quantile, self.friction = validation, seed, quantile, friction
         self.extended = ExtendedValidation(validation) if extended is None else extended
         self.actuator, self.validation = self.extended.actuator, self.extended.validation
@@ -84,7 +93,13 @@ class DynamicsStudy(ShortRepr):
 
     def fresh_copy(self, quantile: float | None = None) -> DynamicsStudy:
         """Return a study of the same experiment that has learned nothing yet, with a quantile if it is given."""
-        return DynamicsStudy(self.given, self.seed, self.quantile if quantile is None else quantile)
+        quantile = self.quantile if quantile is None else quantile
+        return DynamicsStudy(self.given, self.seed, quantile, settings=self.settings)
+
+    def _with(
+        self, given: Validation, extended: ExtendedValidation, friction: DryFriction | None = None
+    ) -> DynamicsStudy:
+        return DynamicsStudy(given, self.seed, self.quantile, extended, friction, self.settings)
 
     def state_of_parts(self) -> tuple[str, bytes]:
         """Return the description of M and the synthesizer, and some steps of M, which a description may not show."""
@@ -126,35 +141,38 @@ class DynamicsStudy(ShortRepr):
         agreeing = self._agreeing(extended, logged, executed, allowed)
         if agreeing is not None:
             return agreeing
-        learned = self._learn(extended, logged, with_data=True)
+        learned, settings = self._learn(extended, logged, with_data=True), self.settings
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
-            if learned is None or len(executed) < _FEWEST_AGAINST:
+            if learned is None or len(executed) < settings.actuator_from:
                 return learned
             actuator = None if logged or self.friction else self._found_actuator(executed, learned)
             if actuator is not None:
                 if self._actuated is None or self._actuated.actuator != actuator:
                     acting = ExtendedValidation(self.given, actuator, executed[0][1].inputs.shape[-1])
-                    self._actuated = DynamicsStudy(self.given, self.seed, self.quantile, acting)
+                    self._actuated = self._with(self.given, acting)
                 return self._actuated.learn(executed) or learned
             held = None if logged else self._with_friction(executed, learned)
             if held is not None:
                 return held
-            if not learned.left_out_error > _WELL:
+            if not learned.left_out_error > settings.small_error:
                 return learned
             if (learned.posterior.data.sources == -1).any():
                 without = self._learn(extended, logged, with_data=False)
-                if without is not None and without.left_out_error < min(_WELL, learned.left_out_error / _CLEARLY):
+                clear = min(settings.small_error, learned.left_out_error / settings.clear_factor)
+                if without is not None and without.left_out_error < clear:
                     learned = without
-            if not logged and len(executed) >= _FEWEST_TOLD and learned.left_out_error > _WELL:
+            large = learned.left_out_error > settings.small_error
+            if not logged and len(executed) >= settings.parameter_from and large:
                 # A task parameter that explains the errors of predictions; asked in each doubling of the executions.
-                some = _FEWEST_TOLD
+                some = settings.parameter_from
                 while 2 * some <= len(executed):
                     some *= 2
                 key = digest(trajectory for _, trajectory in executed[:some])
                 if key not in self._found:
                     name, with_it, without_it = self._most_telling(executed[:some])
                     # If errors remain, it may be a sign of noise, or of a state that is not recorded.
-                    self._found[key] = name if with_it < min(_WELL, without_it / _CLEARLY) else None
+                    clear = min(settings.small_error, without_it / settings.clear_factor)
+                    self._found[key] = name if with_it < clear else None
                 parameter = self._found[key]
                 learned = learned if parameter is None else self._with_parameter(parameter).learn(executed)
         return learned
@@ -285,13 +303,13 @@ class DynamicsStudy(ShortRepr):
     def _with_parameter(self, name: str) -> DynamicsStudy:
         if name not in self._others:
             given = self.given.with_parts(physical=[*self.given.physical, name])
-            self._others[name] = DynamicsStudy(given, self.seed, self.quantile, self.extended.of(given))
+            self._others[name] = self._with(given, self.extended.of(given))
         return self._others[name]
 
     def _found_actuator(self, executed: Executed, learned: LearnedDynamics) -> Actuator | None:
         """Return a delay and a lag of inputs that explain the errors of predictions; one that is found is refined."""
         actuator = None
-        counts = schedule(_FEWEST_AGAINST, len(executed)) if self.actuator is None else ()
+        counts = schedule(self.settings.actuator_from, len(executed)) if self.actuator is None else ()
         for some in (executed[:count] for count in counts):
             key = digest(trajectory for _, trajectory in some)
             if key not in self._actuators:
@@ -336,30 +354,31 @@ class DynamicsStudy(ShortRepr):
         """
         if self.friction is not None or self.given.outputs is not None:
             return None
-        study: DynamicsStudy | None = None
-        for some in (executed[:count] for count in schedule(_FEWEST_HELD, len(executed))):
+        study, settings = None, self.settings
+        for some in (executed[:count] for count in schedule(settings.friction_from, len(executed))):
             key = digest(trajectory for _, trajectory in some)
             if key not in self._slowed:
                 self._slowed[key] = study  # also if its search fails
                 without = learned if len(some) == len(executed) else self._learned_alone(some, with_data=True)
-                if without is not None and (study is not None or without.left_out_error > _WELL):
+                if without is not None and (study is not None or without.left_out_error > settings.small_error):
                     tried = self._friction_study(some)
-                    if tried and (study is not None or _error_of_rates(tried.learn(some), without) < _HALF):
+                    share = settings.friction_share
+                    if tried and (study is not None or _error_of_rates(tried.learn(some), without) < share):
                         self._slowed[key] = tried
             study = self._slowed[key]
         held = None if study is None else study.learn(executed)
-        return held if _error_of_rates(held, learned) < _KEPT else None
+        return held if _error_of_rates(held, learned) < settings.kept_share else None
 
     def _friction_study(self, executed: Executed) -> DynamicsStudy | None:
         """Return a study of M with the dry friction that executions show; None if they show none."""
         extended, model = self.extended.executions(executed), before_refinement(self.validation.model)
         recorded = self._recorded(extended, (), with_data=False) if extended else None
-        friction = None
+        friction, settings = None, self.settings.friction
         with single_threaded(), np.errstate(all="ignore"), contextlib.suppress(RuntimeError):  # of the least squares
-            friction = None if recorded is None else found_friction(model, recorded[0])
+            friction = None if recorded is None else found_friction(model, recorded[0], settings)
         if friction is None:
             return None
-        return DynamicsStudy(self.given, self.seed, self.quantile, self.extended, friction)
+        return self._with(self.given, self.extended, friction)
 
     def _most_telling(self, executed: Executed) -> tuple[str | None, float, float]:
         """Return the task parameter with which predictions err least, and the left-out errors with it and without."""
@@ -383,7 +402,8 @@ class DynamicsStudy(ShortRepr):
         Each execution is predicted from the others, with the parameter as a state and without it. It is None if there
         are too few executions, or if no parameter halves the error.
         """
-        if len(learned.executed) < _FEWEST_TOLD or not learned.left_out_error > _WELL:
+        settings = self.settings
+        if len(learned.executed) < settings.parameter_from or not learned.left_out_error > settings.small_error:
             return None
         plain = [(point, self.extended.recorded(trajectory)) for point, trajectory in learned.executions]
         name, with_it, without_it = self._most_telling(plain)
@@ -401,7 +421,8 @@ class DynamicsStudy(ShortRepr):
             if learned is None:
                 return self._predict_vectors(executed)
             loops = self.extended.loops
-            in_parallel = loops is not None and not loops.batch_shape and self.extended.seconds > _SLOW
+            slow = self.extended.seconds > self.settings.slow_loop
+            in_parallel = loops is not None and not loops.batch_shape and slow
             planner, posterior = learned.study.planner, learned.posterior
             exact = PredictedDistance(planner, posterior, learned.executed, in_parallel, posterior.mean)
             # If few centres do not suffice, both predictions are one, so that no task is predicted twice.
@@ -428,5 +449,5 @@ def _error_of_rates(held: LearnedDynamics | None, without: LearnedDynamics) -> f
     rates = held.study.friction.rates
     noise = (held.posterior.deviations[rates] / np.maximum(held.model_errors[rates], 1e-300)) ** 2
     squares, squares_without = (float((each.left_out_errors[rates] ** 2).sum()) for each in (held, without))
-    noise_alone = min(float(noise.sum()), _NOISE * min(squares, squares_without))
+    noise_alone = min(float(noise.sum()), held.study.settings.noise_share * min(squares, squares_without))
     return float(np.sqrt((squares - noise_alone) / max(squares_without - noise_alone, 1e-300)))

@@ -24,13 +24,6 @@ from ctxval.learning.draws import Draws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
 _DIVERGED = 1e30  # the distance of a loop that diverges, in searches: larger than all others, and finite
-_EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)  # tasks of a global search, for 1, 2, ... parameters
-_SHOWN = 16  # largest number of these tasks
-_NEARBY = 1e-3  # largest change of each coordinate to a task that is nearly the same
-_NEARER = 64  # how many times nearer tasks are that tell kinks of a distance from jumps, a power of 2
-_SCREENED = (8, 1500)  # number of draws of the hyperparameters in a screening, and of tasks in its search on the mean
-_FURTHER = 256  # number of random tasks beside these if draws differ in the dry friction at rest
-_APART = 0.15  # least distance of two tasks that are not next to each other, as a share of the cube's diagonal
 
 
 @dataclass(frozen=True)
@@ -47,13 +40,22 @@ class WorstCaseSettings:
     relevant: int = 700
     peaks: int = 5  # number of local maxima next to which tasks are tried
     nearby: int = 32  # number of tasks next to each of them
+    near: float = 1e-3  # largest change of each coordinate to a task that is nearly the same
+    nearer: int = 64  # how many times nearer tasks are that tell kinks of a distance from jumps, a power of 2
+    apart: float = (
+        0.15  # least distance of two tasks that are not next to each other, as a share of the cube's diagonal
+    )
+    shown: int = 16  # largest number of the best tasks of all draws that each draw tries
+    screened_draws: int = 8  # number of draws of the hyperparameters in a screening
+    screened_tasks: int = 1500  # number of tasks in its search on the mean
+    further: int = 256  # number of random tasks in a screening if draws differ in the dry friction at rest
 
     @classmethod
     def for_dimension(cls, dimension: int, batched: bool = True) -> WorstCaseSettings:
         """Return settings for so many task parameters; there are far fewer tasks if they are designed one by one."""
         if not batched:
             return cls(pool=64, evaluations=256, local_maxima=6, shared=12, moves=2, rounds=0, peaks=1, nearby=8)
-        evaluations = _EVALUATIONS[min(dimension, len(_EVALUATIONS)) - 1]
+        evaluations = (512, 2048, 4096, 6000, 6000, 6000, 12000)[min(dimension, 7) - 1]  # for 1, 2, ... parameters
         return cls(pool=min(1024, evaluations // 4), evaluations=evaluations)
 
 
@@ -90,7 +92,8 @@ class WorstCaseSearch:
 
     def expected_loops(self, draws: int) -> int:
         """Return about how many closed loops a search with so many draws runs, on M and on the draws."""
-        settings, all_draws = self.settings, self.settings.local_maxima + self.settings.shared + _SHOWN
+        settings = self.settings
+        all_draws = settings.local_maxima + settings.shared + settings.shown
         moves = settings.rounds * (2 * self.dimension + settings.moves + 1)
         return 2 * settings.evaluations + all_draws + draws * (all_draws + 2 * moves)
 
@@ -99,7 +102,8 @@ class WorstCaseSearch:
         """About how many closed loops a screening runs."""
         settings = self.settings
         shared = settings.local_maxima + settings.shared // 4
-        return 2 * settings.pool + min(_SCREENED[1], settings.evaluations) + (1 + _SCREENED[0]) * shared
+        screened = min(settings.screened_tasks, settings.evaluations)
+        return 2 * settings.pool + screened + (1 + settings.screened_draws) * shared
 
     @functools.cached_property
     def pool(self) -> Array:
@@ -121,7 +125,8 @@ class WorstCaseSearch:
     @functools.cached_property
     def _in_rows(self) -> tuple[Array, list[PlannedTasks]]:
         """Three nearly equal tasks in a row from each task of the pool, points ``(N, 3, d)``, and their plans."""
-        moves = np.random.default_rng([self._seed, 1]).uniform(-_NEARBY, _NEARBY, self.pool.shape)
+        near = self.settings.near
+        moves = np.random.default_rng([self._seed, 1]).uniform(-near, near, self.pool.shape)
         outside = (self.pool + 2 * moves < 0) | (self.pool + 2 * moves > 1)
         tasks = self.pool[:, None] + np.arange(3)[:, None] * np.where(outside, -moves, moves)[:, None]
         return tasks, self.planner.plan(tasks.reshape(-1, self.dimension))
@@ -144,11 +149,11 @@ class WorstCaseSearch:
         return float(jumps[np.isfinite(jumps)].max(initial=0.0))
 
     def _nearer(self, posterior: AnyPosterior, tasks: Array, distances: Array) -> Array:
-        """Return distances ``(k, 3)`` of tasks in a row that are ``_NEARER`` times nearer, where they bend most."""
+        """Return distances ``(k, 3)`` of tasks in a row that are much nearer, where they bend most."""
         bends = np.abs(distances[:, 1] - 0.5 * (distances[:, 0] + distances[:, 2]))
         rows = np.argsort(-np.nan_to_num(bends, nan=0.0, posinf=0.0), kind="stable")[:64]
         tasks, distances = tasks[rows], distances[rows]
-        for _ in range(int(np.log2(_NEARER))):  # of each row, the half with the larger change is kept: a jump is in it
+        for _ in range(int(np.log2(self.settings.nearer))):  # a jump is in the half of a row with the larger change
             later = np.abs(distances[:, 2] - distances[:, 1]) > np.abs(distances[:, 1] - distances[:, 0])
             ends = np.where(later[:, None], [1, 2], [0, 1])
             tasks, distances = np.take_along_axis(tasks, ends[..., None], 1), np.take_along_axis(distances, ends, 1)
@@ -184,12 +189,12 @@ class WorstCaseSearch:
         starts = np.concatenate([known, best])
         with single_threaded():
             if not globally and not is_kinked(self.planner.validation.distance):
-                budget = min(_SCREENED[1], settings.evaluations)
+                budget = min(settings.screened_tasks, settings.evaluations)
                 same = posterior.rough_mean is posterior.mean.searched
                 rough = None if same else self._on_one(posterior.rough_mean)
                 box = np.zeros(self.dimension), np.ones(self.dimension)
-                points, values = ascend(distance, box, budget, starts[: len(known) + _SHOWN], rng, rough)
-                apart = separated_rows(points, _APART * np.sqrt(self.dimension), settings.local_maxima)
+                points, values = ascend(distance, box, budget, starts[: len(known) + settings.shown], rng, rough)
+                apart = separated_rows(points, settings.apart * np.sqrt(self.dimension), settings.local_maxima)
                 return self._of_mean(posterior, float(values[0]), points[apart], len(points))
             evaluations = max(len(starts) + 50, settings.evaluations - len(self.pool))
             maximum = search_globally(distance, self.dimension, starts, rng, evaluations=evaluations)
@@ -216,9 +221,9 @@ class WorstCaseSearch:
         """Return the largest distances of a few draws over local maxima, known and random tasks: a lower bound."""
         with single_threaded():
             tasks = self._shared_tasks(of_mean, known, self.settings.shared // 4, rng)
-            draws = posterior.draw(self.relevant(posterior, tasks, rng), rng, 1, _SCREENED[0])
+            draws = posterior.draw(self.relevant(posterior, tasks, rng), rng, 1, self.settings.screened_draws)
             if _sticks(posterior) and self.members is None:  # their largest distances lie far from those of the mean
-                further = self.pool[rng.permutation(len(self.pool))[:_FURTHER]]
+                further = self.pool[rng.permutation(len(self.pool))[: self.settings.further]]
                 points, maxima, loops = self._search_draws(draws, np.concatenate([tasks, further]), rng)
                 return of_mean.with_draws(maxima, points, loops, draws.left_out)
             values = self._distances(draws, tasks)
@@ -241,8 +246,9 @@ class WorstCaseSearch:
             # are no needles: they are flat between tasks that are nearer. Nor is a task at which a joint is just held,
             # like those on one side of it.
             peaks = of_mean.local_maxima[: 0 if self.members is not None else self.settings.peaks]
-            near = _NEARBY / _NEARER if is_kinked(self.planner.validation.distance) else _NEARBY
-            moves = rng.uniform(-near, near, (len(peaks), self.settings.nearby, self.dimension))
+            settings = self.settings
+            near = settings.near / settings.nearer if is_kinked(self.planner.validation.distance) else settings.near
+            moves = rng.uniform(-near, near, (len(peaks), settings.nearby, self.dimension))
             beside = np.concatenate([peaks[:, None], np.clip(peaks[:, None] + moves, 0, 1)], axis=1)
             flat = self._distances(posterior.mean, beside.reshape(-1, self.dimension))[0]
             distances = np.maximum(flat.reshape(beside.shape[:2]), 0.0)
@@ -283,7 +289,7 @@ class WorstCaseSearch:
         best, points = np.take_along_axis(values, order[:, :1], 1)[:, 0], tasks[order[:, 0]]
         # The best task of each draw that is not next to its best one; the second best if all are.
         ordered = tasks[order]
-        apart = np.linalg.norm(ordered - ordered[:, :1], axis=2) > _APART * np.sqrt(self.dimension)
+        apart = np.linalg.norm(ordered - ordered[:, :1], axis=2) > self.settings.apart * np.sqrt(self.dimension)
         rows = np.where(apart.any(axis=1), apart.argmax(axis=1), min(1, len(tasks) - 1))
         second, searched = ordered[np.arange(len(ordered)), rows], np.arange(len(draws))
         for round_, share in enumerate((0.1, 0.05, 0.02, 0.007)[: self.settings.rounds]):
@@ -291,7 +297,7 @@ class WorstCaseSearch:
             if round_ == 2:
                 # Each draw tries the best tasks of all others.
                 best_first = points[np.argsort(-best, kind="stable")]
-                shown = best_first[separated_rows(best_first, 0.02 * np.sqrt(self.dimension), _SHOWN)]
+                shown = best_first[separated_rows(best_first, 0.02 * np.sqrt(self.dimension), self.settings.shown)]
                 distances = self._distances(draws, shown)
                 points, best = _better(points, best, np.broadcast_to(shown, (len(best), *shown.shape)), distances)
                 loops += distances.size
