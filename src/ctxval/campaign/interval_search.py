@@ -39,6 +39,7 @@ from ctxval.certificates.dynamics_diagnostics import (
     only_tests_missing,
     raised,
     unentered_pocket,
+    untested_rest,
 )
 from ctxval.certificates.explained import CONTRADICTED, LEVERAGE, evidence_against, least_explained
 from ctxval.certificates.options import WITHIN
@@ -253,6 +254,7 @@ class IntervalSearch:
         # The whole evidence may decide if nothing that a few draws show leaves the verdict open.
         bound, enough = self._bound(evidence), len(trials.ended) >= FEWEST
         decides = enough and raised(evidence, bound) <= self.limit and doubt_of(evidence, self.best, bound) is None
+        decides = decides and untested_rest(evidence, self.limit) is None
         if decides and evidence.unvisited_region is None and dynamics.kept_evidence(trials, confidence) is None:
             learned = dynamics.learned(trials)
             evidence = evidence if learned is None else replace(evidence, unvisited_region=learned.unvisited_region)
@@ -272,7 +274,8 @@ class IntervalSearch:
         lacks_tests = self._lacks_tests_alone(evidence)
         if isinstance(kind, Automatic) and evidence.quantile is None and self._suite is None:
             chosen = sum(trial.origin not in DRAWN for trial in trials)
-            patient = chosen < 16 or lacks_tests or unentered_pocket(evidence) is not None
+            remedies = unentered_pocket(evidence), untested_rest(evidence, self.limit)
+            patient = chosen < 16 or lacks_tests or any(remedies)
             if not patient:
                 return self._by_distance()
             covers = not evidence.negligible and covering(self._points(trials), kind.resolution, 0) is not None
@@ -304,7 +307,9 @@ class IntervalSearch:
         new = CandidateFilter(self._near, steady)
         # Tasks that differ in parameters that change no prediction are one task, with values that are spread.
         if learned is not None and self._suite is None:
-            new = CandidateFilter(self._near, steady, learned.spread_unseen, learned.study.seen_parameters)
+            new = CandidateFilter(
+                self._near, steady, learned.spread_unseen, learned.study.seen_parameters, learned.at_untested_rest
+            )
         point = next_task(evidence, known, best, limit, self.options.confidence, new)
         if len(waiting) and (point is None or np.abs(waiting - point)[:, new.seen].max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.

@@ -16,6 +16,7 @@ from ctxval.certificates.dynamics_diagnostics import (
     unsampled_corner,
     unsampled_parameter,
     untested,
+    untested_rest,
 )
 
 _NEARS = 0.7  # share of the way from the largest executed distance to the limit from which a draw is near it
@@ -30,6 +31,8 @@ class CandidateFilter:
     #: moves a new task ``(d,)``, given the known ones ``(n, d)``; None if tasks are not moved
     spread: Callable[[Array, Array], Array] | None = None
     seen: Rows | slice = field(default_factory=lambda: slice(None))  #: coordinates in which a moved task must be new
+    #: a task like this one ``(d,)`` that also tests friction at rest where it is needed; None if there is none
+    at_untested_rest: Callable[[Array], Array | None] = lambda task: None
 
     def first(self, tasks: Array, known: Array, farthest: Array) -> Array | None:
         """Return the first of tasks ``(m, d)`` that may be executed, as it is moved; None if there is none."""
@@ -68,6 +71,8 @@ def next_task(
     if evidence.friction:  # one execution at the least friction at rest that nears the limit rules out all larger ones
         first = int(np.searchsorted(evidence.maxima[order], best + _NEARS * (limit - best), side="right"))
         highest = evidence.points[[*order[first:], *order[:first][::-1]]]
+        if (elsewhere := new.at_untested_rest(highest[0])) is not None:
+            highest = np.concatenate([elsewhere[None], highest])
     farthest, largest = evidence.coverage.task[None], evidence.local_maxima
     exceeds = evidence.upper(confidence) > limit
     # Every third execution leads farthest from the records in any case, but friction is known where they are dense.
@@ -87,6 +92,8 @@ def next_task(
             candidates = [np.array(evidence.unvisited_region.tasks), *candidates]
     elif evidence.search_shortfall > 1 or untested(evidence, best, limit):
         candidates = [largest, highest, farthest]
+    elif evidence.untested_rest is not None and untested_rest(evidence, limit) is not None:
+        candidates = [np.array(evidence.untested_rest.tasks).reshape(-1, known.shape[1]), highest, farthest]
     else:
         candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]
 

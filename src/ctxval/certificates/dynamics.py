@@ -132,7 +132,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
     assumptions = statements.dynamics_assumptions(evidence)
     doubt = doubt or diagnostics.doubt_of(evidence, sample.best, bound)
     level = upper if sample.threshold is None else sample.threshold
-    doubt = doubt or diagnostics.unsupported(evidence, level, bound)
+    doubt = doubt or diagnostics.unsupported(evidence, level, bound) or diagnostics.untested_rest(evidence, level)
     above = sum(each.distance > level for each in evidence.executed)
     is_noisy = evidence.quantile is not None
     copied = {name: getattr(evidence, name) for name in _COPIED}
@@ -172,6 +172,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
         "share_supported": share_supported(evidence.executions, above, confidence) if is_noisy else None,
         "variance_left_out": evidence.left_out,
         "unvisited_region": evidence.unvisited_region and asdict(evidence.unvisited_region),
+        "untested_rest": evidence.untested_rest and asdict(evidence.untested_rest),
         "empty_box": None if empty is None else asdict(empty),
         "pushed": evidence.pushed and evidence.pushed.to_json(),
         "differing": None if differing is None else [sample.numbers[row] for row in differing],

@@ -16,7 +16,7 @@ from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvi
 from ctxval.certificates.explained import CONTRADICTED, evidence_against, least_explained, support_of
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.sentences import withdrawals as sentences
-from ctxval.core.coverage import StateInputGap
+from ctxval.core.coverage import REST_GAP, StateInputGap
 
 # Limits; docs/theory.md has the reason for each.
 
@@ -272,6 +272,15 @@ def unexplained(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
         yield sentences.DRIFT.format(cause=evidence.drift[0], p=evidence.drift[1])
     if evidence.uneven > UNEVEN:
         yield sentences.UNEVEN.format(times=evidence.uneven)
+
+
+def untested_rest(evidence: DynamicsEvidence, threshold: float) -> str | None:
+    """Return that larger friction at rest at an untested place would exceed a threshold; None if it would not."""
+    rest = evidence.untested_rest
+    if rest is None or rest.size <= REST_GAP or rest.highest <= threshold:
+        return None
+    place, length = with_units(rest.place), radius_of(dict.fromkeys(rest.place, rest.length))
+    return sentences.UNTESTED_REST.format(length=length, place=place, times=rest.times, highest=rest.highest)
 
 
 def unsupported(evidence: DynamicsEvidence, threshold: float, bound: float) -> str | None:

@@ -14,7 +14,14 @@ from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import rank_of
 from ctxval.certificates.explained import ExplainedExecution
 from ctxval.certificates.prediction_tests import MANY, TESTS
-from ctxval.core.coverage import StateInputCoverage, StateInputGap, UnsampledCorner, UnsampledParameter, UnvisitedRegion
+from ctxval.core.coverage import (
+    StateInputCoverage,
+    StateInputGap,
+    UnsampledCorner,
+    UnsampledParameter,
+    UntestedRest,
+    UnvisitedRegion,
+)
 from ctxval.core.learned_numbers import PushedDistances
 from ctxval.core.quantiles import LEVELS, QUANTILE, chance_of_more
 from ctxval.core.trial import Origin
@@ -113,6 +120,7 @@ class DynamicsEvidence(ShortRepr):
     drift: tuple[str, float] | None = None  #: with what effects of executions change, and its p-value; None without any
     #: of friction at rest, by how many times a force that a joint withstood exceeds one that moved it elsewhere
     uneven: float = 1.0
+    untested_rest: UntestedRest | None = None  #: where friction at rest was not tested; None without it
     #: the largest distance under errors of M as small as all that were recorded; 0 if such errors are learned
     negligible: float = 0.0
 
@@ -170,6 +178,8 @@ class DynamicsEvidence(ShortRepr):
                 "pushed": values["pushed"] and PushedDistances.from_json(values["pushed"]),
                 "unvisited_region": pocket
                 and UnvisitedRegion(**{**pocket, "tasks": tuple(map(tuple, pocket["tasks"]))}),
+                "untested_rest": (rest := values["untested_rest"])
+                and UntestedRest(**{**rest, "tasks": tuple(map(tuple, rest["tasks"]))}),
                 "physical": tuple(values["physical"]),
                 "executed": tuple(
                     ExplainedExecution(

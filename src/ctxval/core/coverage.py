@@ -63,17 +63,22 @@ class UnsampledParameter(ShortRepr):
     idle: bool = False  #: whether a parameter of this kind changes no predicted distance either; not of a suite
 
 
+REST_GAP = 0.1
+"""Longest stretch in which friction at rest is not tested, as a share of the range in which joints leave rest."""
+
+
 @dataclass(frozen=True)
 class UntestedRest:
-    """The place that is farthest from all places where friction at rest was tested.
+    """The longest stretch of places in which no execution tested friction at rest.
 
-    Executions test a place if a joint leaves rest there under a force that hardly exceeds the usual friction at rest.
+    An execution tests a place if a joint leaves rest there under a force that is little above usual friction at rest.
     """
 
-    size: float  #: distance of the nearest tested place, as a share of the range in which joints leave rest
-    place: dict[str, float]  #: the place, by the label of the joint's coordinate, in its unit
-    within: float  #: distance of the nearest tested place, in this unit
+    size: float  #: its length, as a share of the range in which joints leave rest
+    place: dict[str, float]  #: a place in it, by the label of the joint's coordinate, in its unit
+    length: float  #: its length, in this unit
     force: float  #: the largest force that tests a place, in the unit of the input
-    highest: float  #: the largest predicted distance if friction at rest is several times as large everywhere
-    #: tasks whose predicted runs leave rest at such a place under such a force, points of the unit cube, the best first
+    times: float  #: multiple of the usual friction at rest that the stretch may hold with
+    highest: float  #: the largest predicted distance if every place holds with so much; infinity if it is not known
+    #: tasks whose predicted runs leave rest in the stretch under a force that tests it, points of the unit cube
     tasks: tuple[tuple[float, ...], ...] = ()

@@ -13,7 +13,7 @@ from scipy.spatial.distance import cdist
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import parted
-from ctxval.core.coverage import StateInputCoverage, UnsampledParameter, UntestedRest, UnvisitedRegion
+from ctxval.core.coverage import REST_GAP, StateInputCoverage, UnsampledParameter, UntestedRest, UnvisitedRegion
 from ctxval.core.labels import labels_of
 from ctxval.core.learned_numbers import PushedDistances
 from ctxval.core.model import Model, predicted_steps, with_memory
@@ -32,7 +32,7 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.regular import Boundary, RegularTransitions
-from ctxval.learning.rest_places import REST_GAP, RestPlaces, rest_places, untested_rest
+from ctxval.learning.rest_places import RestPlaces, rest_places, untested_rest
 from ctxval.learning.tolerance import push_response
 from ctxval.learning.worst_case import WorstCase
 
@@ -269,7 +269,7 @@ class LearnedDynamics(ShortRepr):
 
     @functools.cached_property
     def untested_rest(self) -> UntestedRest | None:
-        """The place farthest from those where friction at rest was tested; None without such friction."""
+        """The longest stretch of places where friction at rest was not tested; None without such friction."""
         with single_threaded(), np.errstate(all="ignore"):
             return untested_rest(self._rest_places, self.labels, self._rng(7))
 
@@ -280,7 +280,7 @@ class LearnedDynamics(ShortRepr):
         """
         if self.untested_rest is None or self.untested_rest.size <= REST_GAP:
             return None
-        worst = max(self._rest_places, key=lambda each: each.farthest[0])
+        worst = max(self._rest_places, key=lambda each: each.widest[0])
         with single_threaded(), np.errstate(all="ignore"):
             return worst.like(task, self._rng(8))
 

@@ -14,25 +14,38 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
-from ctxval.core.coverage import UntestedRest
+from ctxval.core.coverage import REST_GAP, UntestedRest
 from ctxval.core.trajectory import Transitions
 from ctxval.learning.closed_loops import LoopPlanner, Loops, PlannedTasks
 from ctxval.learning.dry_friction import DryFriction
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
-REST_GAP = 0.0375
-"""Largest distance of a tested place, as a share of the range in which joints leave rest: 7.5 % lie between two."""
-FACTOR = 3.0  # multiple of the usual friction at rest that is said to hold at an untested place
-_MORE = 1.5  # multiple of the usual friction at rest up to which a force tests a place
-_LEAST = 1.1  # least multiple of the smallest force that moved a joint up to which a force tests a place
-_AIMED = 0.9  # share of this force that tasks for a test have
-_HARDER = 1.3  # by how much the force of a task exceeds the one that the joint withstood there
-_SLOW = 0.05  # rate up to which a joint may be at rest, as a share of its root mean square
-_MOVED = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005)  # steps of a search for a task, as shares of the cube
-_TRIED, _KEPT = 48, 8  # tasks in each of these steps, and the best ones
-_APART = 0.3  # share of ``REST_GAP`` by which a place may differ from the one that is looked for
-_WITHIN = 0.05  # share by which a force may differ from the one that is looked for
-_NEAR = 2.0  # largest difference of a task that is found, in units of the two
+
+@dataclass(frozen=True)
+class RestSettings:
+    """Which forces test friction at rest at a place, and how tasks with such forces are looked for.
+
+    They were chosen on the systems cylinder, rotary-seal and detent-rail of benchmarks/friction_systems.py.
+    """
+
+    factor: float = 3.0  # multiple of the usual friction at rest that an untested place may hold with
+    tests: float = 1.75  # multiple of the usual friction at rest up to which a force tests a place
+    most: float = 1.5  # the same, of the smallest force that moved the joint
+    least: float = 1.1  # least multiple of this smallest force up to which a force tests a place
+    aimed: float = 0.8  # share of the largest force that tests a place, for tasks that shall test one
+    harder: float = 1.3  # by how much the force of a task exceeds the one that the joint withstood there
+    slow: float = 0.05  # rate up to which a joint may be at rest, as a share of its root mean square
+    moves: tuple[float, ...] = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005)  # steps of a search for tasks, as shares of the cube
+    tried: int = 48  # tasks in each of these steps
+    kept: int = 8  # the best tasks, from which the next step begins
+    filled: float = 0.95  # length of the stretches between tested places that tasks shall leave, as a share of the most
+    apart: float = (
+        0.05  # share of the longest stretch by which a task's place may differ from that which is aimed at
+    )
+    apart_in_force: float = 0.05  # share by which its force may differ
+
+
+SETTINGS = RestSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +56,7 @@ class Departures:
     forces: Array  # what acts on it there, in units of its input, without friction's part that grows with it (d,)
     rows: Rows  # of predicted runs, the task (d,)
 
-    def __getitem__(self, which: Array) -> Departures:
+    def __getitem__(self, which: Mask) -> Departures:
         return Departures(self.places[which], self.forces[which], self.rows[which])
 
 
@@ -66,7 +79,7 @@ class RestPlaces:
     @functools.cached_property
     def needed(self) -> Departures:
         """The predicted departures that larger friction at rest would prevent."""
-        return self.predicted[self.predicted.forces <= FACTOR * self.usual]
+        return self.predicted[self.predicted.forces <= SETTINGS.factor * self.usual]
 
     @functools.cached_property
     def width(self) -> float:
@@ -74,62 +87,62 @@ class RestPlaces:
         return max(float(np.ptp(self.needed.places)), 1e-300) if len(self.needed.places) else 1e-300
 
     @functools.cached_property
-    def farthest(self) -> tuple[float, float]:
-        """The largest distance of a needed place from a tested one, as a share of the range, and this place.
+    def widest(self) -> tuple[float, int]:
+        """The longest stretch without a tested place around a needed one, as a share of the range, and its row.
 
         A place is tested by a departure under the force that is needed there, or an allowed one.
         """
         needed, left = self.needed, self.left
-        most = np.maximum(needed.forces, self.allowed)[:, None]
-        away = np.where(left.forces <= most, np.abs(needed.places[:, None] - left.places), self.width)
-        nearest = away.min(axis=1, initial=self.width)
-        row = int(nearest.argmax())
-        return float(nearest[row]) / self.width, float(needed.places[row])
+        if not len(needed.places):
+            return 0.0, 0
+        tests = left.forces <= np.maximum(needed.forces, self.allowed)[:, None]
+        away = left.places - needed.places[:, None]
+        above = np.where(tests & (away >= 0), away, np.inf).min(axis=1, initial=np.inf)
+        below = np.where(tests & (away <= 0), -away, np.inf).min(axis=1, initial=np.inf)
+        stretch = np.minimum(above, needed.places.max() - needed.places)
+        stretch += np.minimum(below, needed.places - needed.places.min())
+        stretch = np.minimum(stretch, 2 * np.minimum(above, below))  # no run needs other places of it
+        row = int(stretch.argmax())
+        return float(stretch[row]) / self.width, row
 
     @property
     def aim(self) -> tuple[float, float]:
-        """A place next to the farthest one from which fewest departures fill the gap, and the force for a test."""
-        place, radius = self.farthest[1], REST_GAP * self.width
-        tested = np.sort(self.left.places[self.left.forces <= self.allowed])
-        low, high = float(self.needed.places.min()), float(self.needed.places.max())
-        below, above = tested[tested <= place], tested[tested > place]
-        if not len(below):
-            place = min(low + _AIMED * radius, high)
-        elif not len(above):
-            place = max(high - _AIMED * radius, low)
-        else:
-            gap = above[0] - below[-1]
-            place = float(below[-1] + gap / max(np.ceil(gap / (2 * radius)), 2))
+        """A place in this stretch from which fewest departures fill it, and a force that tests the place."""
+        place, most = float(self.needed.places[self.widest[1]]), REST_GAP * self.width
+        tested = self.left.places[self.left.forces <= self.allowed]
+        ends = np.append(tested, [self.needed.places.min(), self.needed.places.max()])
+        low, high = ends[ends <= place].max(), ends[ends >= place].min()
+        place = float(low + (high - low) / max(np.ceil((high - low) / (SETTINGS.filled * most)), 2))
         # Where a force did not move the joint, a larger one may.
-        withstood = self.held.forces[np.abs(self.held.places - place) <= radius].max(initial=0.0)
-        return place, max(_AIMED * self.allowed, _HARDER * float(withstood))
+        withstood = self.held.forces[np.abs(self.held.places - place) <= 0.5 * most].max(initial=0.0)
+        return place, max(SETTINGS.aimed * self.allowed, SETTINGS.harder * float(withstood))
 
     def tasks(self, place: float, force: float, rng: np.random.Generator) -> Array:
         """Return tasks ``(k, d)`` whose predicted runs leave rest about there under about this force, the best first.
 
         It is empty if no such task is found.
         """
-        scale = _APART * REST_GAP * self.width
+        scale = SETTINGS.apart * REST_GAP * self.width
 
         def missed(found: Departures, count: int) -> Array:
             least = np.full(count, np.inf)
-            away = np.hypot((found.places - place) / scale, np.log(found.forces / force) / _WITHIN)
+            away = np.hypot((found.places - place) / scale, np.log(found.forces / force) / SETTINGS.apart_in_force)
             np.minimum.at(least, found.rows, away)
             return least
 
         points, errors = self.pool, missed(self.predicted, len(self.pool))
         moves = self.planner.batched and self.planner.validation.space.members is None
-        for step in _MOVED if moves else ():
-            best = np.argsort(errors, kind="stable")[:_KEPT]
-            moved = np.repeat(points[best], _TRIED // _KEPT, axis=0)
+        for step in SETTINGS.moves if moves else ():
+            best = np.argsort(errors, kind="stable")[: SETTINGS.kept]
+            moved = np.repeat(points[best], SETTINGS.tried // SETTINGS.kept, axis=0)
             moved = np.clip(moved + step * rng.uniform(-1, 1, moved.shape), 0.0, 1.0)
             planned = self.planner.plan(moved)
             loops = self.planner.run(self.posterior.mean, planned)
             found = predicted_departures(self.posterior, planned, loops, self.joint, self.coordinate, self.errors)
             points = np.concatenate([points[best], moved])
             errors = np.concatenate([errors[best], missed(found, len(moved))])
-        order = np.argsort(errors, kind="stable")[:_KEPT]
-        return np.asarray(points[order[errors[order] <= _NEAR]])
+        order = np.argsort(errors, kind="stable")[: SETTINGS.kept]
+        return np.asarray(points[order[errors[order] <= 2]])
 
     def like(self, task: Array, rng: np.random.Generator) -> Array | None:
         """Return a task whose predicted run leaves rest under the same force where a test is needed; None without one.
@@ -171,9 +184,11 @@ def rest_places(
             return Departures(at[which], force[which], np.flatnonzero(which))
 
         left = those(pushes.started[:, j] | pushes.turned[:, j])
-        lowest = float(force[pushes.started[:, j]].min(initial=np.inf))
-        usual = 0.5 * (shown + lowest) if np.isfinite(lowest) else shown
-        allowed = float(np.clip(_MORE * usual, _LEAST * lowest, _MORE * lowest)) if np.isfinite(lowest) else shown
+        usual = allowed = shown
+        if pushes.started[:, j].any():
+            lowest = float(force[pushes.started[:, j]].min())
+            usual = 0.5 * (shown + lowest)
+            allowed = float(np.clip(SETTINGS.tests * usual, SETTINGS.least * lowest, SETTINGS.most * lowest))
         predicted = predicted_departures(posterior, planned, loops, j, coordinate, pushes.errors)
         held = those(pushes.held[:, j])
         places.append(
@@ -197,7 +212,7 @@ def predicted_departures(
     for plan, each in zip(planned, loops, strict=True):
         x, u = each.states[0], each.inputs[0, ..., : posterior.data.inputs]
         before, after = x[:, :-1, rate], x[:, 1:, rate]
-        slow = _SLOW * np.sqrt(np.nanmean(np.where(np.isfinite(x[..., rate]), x[..., rate], 0.0) ** 2))
+        slow = SETTINGS.slow * np.sqrt(np.nanmean(np.where(np.isfinite(x[..., rate]), x[..., rate], 0.0) ** 2))
         may = (np.abs(before) <= slow) & (np.abs(after) > friction.still[joint]) | (before * after < 0)
         task, step = np.nonzero(may & np.isfinite(x).all(axis=2)[:, 1:])
         if len(task):
@@ -211,29 +226,28 @@ def predicted_departures(
 
 
 def untested_rest(places: Sequence[RestPlaces], labels: Sequence[str], rng: np.random.Generator) -> UntestedRest | None:
-    """Return the place that is farthest from those where friction at rest was tested; None if none is in need.
+    """Return the longest stretch of places where friction at rest was not tested; None if no place is in need.
 
     States have these labels.
     """
     needing = [each for each in places if len(each.needed.places)]
     if not needing:
         return None
-    worst = max(needing, key=lambda each: each.farthest[0])
-    size, place = worst.farthest
+    worst = max(needing, key=lambda each: each.widest[0])
+    size, row = worst.widest
     posterior, planner = worst.posterior, worst.planner
     mean = posterior.mean
     assert isinstance(mean.model, DryFriction)
     # What is predicted if every place held with as much as an untested one may.
     rest = mean.model.rest.copy()
-    rest[..., worst.joint] = np.maximum(rest[..., worst.joint], FACTOR * worst.usual)
+    rest[..., worst.joint] = np.maximum(rest[..., worst.joint], SETTINGS.factor * worst.usual)
     strong = replace(mean, model=replace(mean.model, rest=rest))
     tasks: Array = np.empty((0, worst.pool.shape[1]))
     highest = np.inf
     if size > REST_GAP:
         distances = planner.distances(strong, planner.plan(worst.pool), len(worst.pool))
         highest = float(np.nanmax(distances, initial=0.0))
-        tasks = worst.tasks(*worst.aim, rng)
-    label = labels[worst.coordinate]
-    return UntestedRest(
-        size, {label: place}, size * worst.width, worst.allowed, highest, tuple(map(tuple, tasks.tolist()))
-    )
+        tasks = np.concatenate([worst.tasks(*worst.aim, rng), worst.pool[worst.needed.rows[[row]]]])
+    place = {labels[worst.coordinate]: float(worst.needed.places[row])}
+    further = worst.allowed, SETTINGS.factor, highest, tuple(map(tuple, tasks.tolist()))
+    return UntestedRest(size, place, size * worst.width, *further)
