@@ -16,8 +16,8 @@ DEVELOPMENT = ("geared-pendulum", "ball-screw", "loaded-gear", "frictionloss-arm
 """Systems that the method was developed on."""
 REGULAR = ("cart-pole", "gantry", "scara", "harmonic-drive", "xy-table")
 """Others whose friction is of a kind that is learned."""
-OTHERS = ("worn-guide", "two-way-ratchet", "detent-rail", "notched-hinge")
-"""Others whose friction changes with the place or the direction; of the last two, at rest."""
+OTHERS = ("worn-guide", "two-way-ratchet", "detent-rail")
+"""Others whose friction changes with the place or the direction; of the last one, at rest."""
 DEVELOPED_AT_REST = ("cylinder", "rotary-seal", "sealed-table")
 """Others, whose friction is larger at rest than at any rate, which only the smallest moves show.
 
@@ -180,21 +180,6 @@ def sealed(
     return models.Function(repeated(step, substeps), vectorized=True)
 
 
-def notched(push: Push, sliding: float, rest: float, dt: float, notch: tuple[float, float, float]) -> models.Function:
-    """Return a joint like a sealed one, which a notch at a place, within a distance, holds with a multiple at rest."""
-    place, within, times = notch
-
-    def step(x: Array, u: Array) -> Array:
-        h = dt / 40
-        places, speeds = x[..., :1], x[..., 1:]
-        free = speeds + h * push(places, speeds, u)
-        grips = np.where(np.abs(places - place) < within, times * rest, rest)
-        speeds = np.sign(free) * np.maximum(np.abs(free) - h * np.where(speeds == 0, grips, sliding), 0.0)
-        return np.concatenate([places + h * speeds, speeds], axis=-1)
-
-    return models.Function(repeated(step, 40), vectorized=True)
-
-
 def arm_xml(friction: tuple[float, float]) -> str:
     """Return an arm of MuJoCo with two joints, with dry friction or without."""
     joint = '<joint name="{}" axis="0 0 1" damping="{}" frictionloss="{}"/>'
@@ -287,11 +272,6 @@ SYSTEMS: dict[str, Callable[[], Experiment]] = {
     "rotary-seal": lambda: with_seals(
         "rotary-seal", "rad", TaskSpace(**_moves("rad", 0.8, 1.2)),
         geared_pendulum(1.0, 0.0), 0.4, 0.7, [25.0, 3.0], 0.2,
-    ),
-    "notched-hinge": lambda: pair(
-        "notched-hinge", "rad", TaskSpace(**_moves("rad", 0.9, 1.1)),
-        notched(geared_pendulum(1.05, 0.0), 0.5, 0.65, 0.04, (-0.37, 0.09, 2.5)), geared_pendulum(1.0, 0.0),
-        60, 0.04, [25.0, 3.0], 0.2, (0,),
     ),
     "sealed-table": lambda: with_seals(
         "sealed-table", "m", TaskSpace(**_moves("m", 0.4, 0.8, of="_x"), **_moves("m", 0.4, 0.8, of="_y")),

@@ -63,7 +63,7 @@ class UnsampledParameter(ShortRepr):
     idle: bool = False  #: whether a parameter of this kind changes no predicted distance either; not of a suite
 
 
-REST_GAP = 0.1
+REST_GAP = 0.105
 """Longest stretch in which friction at rest is not tested, as a share of the range in which joints leave rest."""
 
 

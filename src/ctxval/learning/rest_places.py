@@ -34,14 +34,16 @@ class RestSettings:
     least: float = 1.1  # least multiple of this smallest force up to which a force tests a place
     aimed: float = 0.8  # share of the largest force that tests a place, for tasks that shall test one
     harder: float = 1.3  # by how much the force of a task exceeds the one that the joint withstood there
+    mostly: tuple[float, float] = (1e-3, 1 - 1e-3)  # quantiles of the needed places that are their range
+    first: float = 2.0  # largest multiple of what motion shows that a task has which also bounds friction at rest
     slow: float = 0.05  # rate up to which a joint may be at rest, as a share of its root mean square
     moves: tuple[float, ...] = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005)  # steps of a search for tasks, as shares of the cube
     tried: int = 48  # tasks in each of these steps
     kept: int = 8  # the best tasks, from which the next step begins
-    filled: float = 0.95  # length of the stretches between tested places that tasks shall leave, as a share of the most
-    apart: float = (
-        0.05  # share of the longest stretch by which a task's place may differ from that which is aimed at
+    filled: float = (
+        0.955  # length of the stretches between tested places that tasks shall leave, as a share of the most
     )
+    apart: float = 0.05  # share of the longest stretch by which a task's place may differ from that which is aimed at
     apart_in_force: float = 0.05  # share by which its force may differ
 
 
@@ -73,13 +75,18 @@ class RestPlaces:
     left: Departures  # where the joint left rest in executions
     held: Departures  # where it did not
     predicted: Departures  # where it leaves rest in predicted runs of the pool
-    usual: float  # the usual friction at rest: the mean of what motion shows, and of the least force that moved it
+    shown: float  # what holds the joint at rest if that is no more than what motion shows
+    usual: float  # the usual friction at rest: the mean of this, and of the least force that moved the joint
     allowed: float  # the largest force that tests a place
 
     @functools.cached_property
     def needed(self) -> Departures:
         """The predicted departures that larger friction at rest would prevent."""
-        return self.predicted[self.predicted.forces <= SETTINGS.factor * self.usual]
+        needed = self.predicted[self.predicted.forces <= SETTINGS.factor * self.usual]
+        if not len(needed.places):
+            return needed
+        low, high = np.quantile(needed.places, SETTINGS.mostly)
+        return needed[(needed.places >= low) & (needed.places <= high)]
 
     @functools.cached_property
     def width(self) -> float:
@@ -155,7 +162,7 @@ class RestPlaces:
         force = float(found.forces.min(initial=np.inf))
         if not force <= self.allowed:
             return None
-        tasks = self.tasks(self.aim[0], force, rng)
+        tasks = self.tasks(self.aim[0], min(force, SETTINGS.first * self.shown), rng)
         return np.asarray(tasks[0]) if len(tasks) else None
 
 
@@ -192,7 +199,9 @@ def rest_places(
         predicted = predicted_departures(posterior, planned, loops, j, coordinate, pushes.errors)
         held = those(pushes.held[:, j])
         places.append(
-            RestPlaces(posterior, planner, j, coordinate, pool, pushes.errors, left, held, predicted, usual, allowed)
+            RestPlaces(
+                posterior, planner, j, coordinate, pool, pushes.errors, left, held, predicted, shown, usual, allowed
+            )
         )
     return places
 
