@@ -11,7 +11,7 @@ export OMP_NUM_THREADS = 1
 unexport PYTHONDONTWRITEBYTECODE
 PIP := -m pip install --quiet --disable-pip-version-check --no-compile
 
-.PHONY: demo test suite quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo watch envelope friction safety causes clean
+.PHONY: demo test suite quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine frozen reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo watch envelope friction safety causes clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -74,6 +74,9 @@ docs: .venv/.test  ## the manual, with its gallery; writes docs/_build/html, and
 	$(BIN)/python $(PIP) --editable '.[docs]'
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 	$(BIN)/python -m pytest -q --thorough --manual=docs/_build/html tests/test_manual_pages.py tests/test_how_to.py -k "manual_is_built or accessible or blocks"
+
+frozen: .venv/.test  ## do stored campaigns still end and choose as they did? Nothing is executed
+	$(BIN)/python benchmarks/frozen_replay.py --workers 2
 
 pictures: .venv/.test  ## those of the README and of the manual; needs Chromium
 	$(BIN)/ctxval run pendulum --search gp-ucb --seed 1 --store docs/pictures/pendulum.sqlite --no-report

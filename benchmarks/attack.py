@@ -408,7 +408,7 @@ def _warm() -> None:
     import h5py
     import matplotlib.backends.backend_agg
     import matplotlib.pyplot
-    import mcap_protobuf.writer
+    import mcap_ros2.writer
     import pyarrow.parquet
     import rosbags.rosbag2
     import rosbags.typesys
@@ -423,7 +423,7 @@ def _warm() -> None:
         importlib.import_module(
             "mujoco"
         )  # it starts a process to find its window library, which is no code of an input
-    assert all((h5py, matplotlib, mcap_protobuf, pyarrow, rosbags, ctxval))
+    assert all((h5py, matplotlib, mcap_ros2, pyarrow, rosbags, ctxval))
     gc.freeze()  # or the collector copies all pages into each fork
 
 

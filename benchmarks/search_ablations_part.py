@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 
 import misleading
-from page_tables import table
 from plants import DEVELOPMENT, REPORTING
 from search_cells import ENDS, ENDS_OF, cells, reached, results
 from study_ablations import ABLATIONS, BUDGET, CHOSEN_BY, ON_PLANTS, OTHERS
@@ -26,40 +23,42 @@ def of_ablation(case: str, without: str) -> dict[int, Result]:
     return results("misleading" if case in misleading.CASES else "auto", case, "auto", ABLATION_SEEDS)
 
 
-def ablation_table() -> str:
-    """Return what is found without each part on the cases, on the seeds that all have."""
-    return _each(ABLATED)
+HEADER = ["case", "search", *ENDS]
 
 
-def plant_ablation_table() -> str:
-    """Return the same for plants."""
-    return _each(ON_PLANTS)
-
-
-def _each(systems: Iterable[str]) -> str:
-    rows = []
-    for case in systems:
+def rows() -> list[list[str]]:
+    """Return what is found without each part on cases and plants, on the seeds that all have."""
+    found_rows = []
+    for case in (*ABLATED, *ON_PLANTS):
         found = {without: of_ablation(case, without) for without in ("auto", *ABLATIONS)}
         found = {without: campaigns for without, campaigns in found.items() if campaigns}
         common = sorted(set.intersection(*map(set, found.values()))) if found else []
         if common and len(found) > 1:
-            rows += [[case, SHOWN.get(name, name), *cells(found[name][seed] for seed in common)] for name in found]
-    return table(["case", "search", *ENDS], rows)
+            found_rows += [
+                [case, SHOWN.get(name, name), *cells(found[name][seed] for seed in common)] for name in found
+            ]
+    return found_rows
 
 
-def new_ablation_table(entries: Iterable[str]) -> str:
-    """Return what is found on further systems without each part, all together, on the campaigns that all have."""
-    found = {
-        name: {(entry, seed): run for entry in entries for seed, run in results("ablations", entry, name).items()}
-        for name in ("auto", *ABLATIONS)
-    }
-    found = {name: campaigns for name, campaigns in found.items() if campaigns}
-    common = sorted(set.intersection(*map(set, found.values()))) if found else []
-    rows = [[SHOWN.get(name, name), *together([found[name][key] for key in common])] for name in found if common]
-    return table(["search", *TOGETHER], rows)
+def new_rows() -> list[list[str]]:
+    """Return what is found on misleading systems without each part, on the campaigns that all have."""
+    found_rows = []
+    for group, entries in {"chosen by": CHOSEN_BY, "others": OTHERS}.items():
+        found = {
+            name: {(entry, seed): run for entry in entries for seed, run in results("ablations", entry, name).items()}
+            for name in ("auto", *ABLATIONS)
+        }
+        found = {name: campaigns for name, campaigns in found.items() if campaigns}
+        common = sorted(set.intersection(*map(set, found.values())))
+        for name in found:
+            found_rows.append([group, SHOWN.get(name, name), *together([found[name][key] for key in common])])
+    return found_rows
 
 
-TOGETHER = ["campaigns", "within 5 %", "within 1 %", "median to 5 %", "mean share of d*", "next to an earlier one"]
+TOGETHER = [
+    *("systems", "search", "campaigns", "within 5 %", "within 1 %", "median to 5 %", "mean share of d*"),
+    "next to an earlier one",
+]
 
 
 def together(campaigns: list[Result]) -> list[str]:
@@ -76,32 +75,40 @@ def together(campaigns: list[Result]) -> list[str]:
     ]
 
 
-def summary_table() -> str:
+SUMMARY = ["without", "systems", "campaigns", "the same", *(f"{percent:g} %" for percent in ENDS_OF)]
+
+
+def summary_rows() -> list[list[str]]:
     """Return, over all campaigns that were repeated without a part, how often the part saves executions."""
     groups = {"chosen by": [*ABLATED, *CHOSEN_BY, *_plants(DEVELOPMENT)], "others": [*OTHERS, *_plants(REPORTING)]}
-    rows = []
+    found = []
     for name in ABLATIONS:
         for group, systems in groups.items():
             pairs = [pair for case in systems for pair in _pairs(case, name)]
-            rows += [[SHOWN.get(name, name), group, *_compared(pairs)]] if pairs else []
-    return table(["without", "systems", "campaigns", "the same", *(f"{percent:g} %" for percent in ENDS_OF)], rows)
+            found += [[SHOWN.get(name, name), group, *_compared(pairs)]] if pairs else []
+    return found
 
 
-def left_out_table() -> str:
-    """Return what the search found when its predictions were also corrected by a discrepancy, beside today's."""
+LEFT_OUT = [
+    *("systems", "campaigns", "the same", *(f"{percent:g} %: fewer / more" for percent in ENDS_OF)),
+    *("mean share of d* with discrepancy", "without it"),
+]
+
+
+def left_out_rows() -> list[list[str]]:
+    """Return what the search found when its predictions were also corrected by a discrepancy, and what it finds now."""
     groups = {
-        "all cases above": [(case, "auto") for case in CASES],
-        "misleading cases below": [(case, "misleading") for case in misleading.CASES],
+        "all cases": [(case, "auto") for case in CASES],
+        "misleading cases": [(case, "misleading") for case in misleading.CASES],
         "chosen by": [(case, "ablations") for case in (*CHOSEN_BY, *_plants(DEVELOPMENT))],
         "others": [(case, "ablations") for case in (*OTHERS, *_plants(REPORTING))],
     }
-    rows = []
+    found = []
     for group, systems in groups.items():
         pairs = [pair for case, study in systems for pair in _before_and_today(case, study)]
         shares = (f"{100 * np.mean([average_share(run) for run in runs]):.1f} %" for runs in zip(*pairs, strict=True))
-        rows += [[group, *_compared(pairs), *shares]] if pairs else []
-    ends = (f"{percent:g} %" for percent in ENDS_OF)
-    return table(["systems", "campaigns", "the same", *ends, "mean share of d* with it", "without it"], rows)
+        found += [[group, *_compared(pairs), *shares]] if pairs else []
+    return found
 
 
 def _before_and_today(case: str, study: str) -> list[tuple[Result, Result]]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from page_tables import table
+from page_tables import Table, table
 from plants import PLANTS, Plant
 from plants.truths import TRUTHS
 from study_auto import Result, first_within, shown
@@ -17,42 +17,46 @@ PERCENTS = (5.0, 1.0)
 
 TEXT = """## Plants from the falsification literature and from robotics
 
-These [plants](../benchmarks/plants/__init__.py) were written down before any search had run on them. Most are ported
-from benchmarks of the ARCH competition, from their published equations, and each module states its source and what
-differs from it. A `development` plant may be used to develop `auto`. Nothing may be chosen by a `reporting` plant. M is
-learned from recorded data of the plant, with new data for each seed.
+These [plants](../benchmarks/plants/__init__.py) were written down before any search had run on them; most are ported
+from the published equations of the ARCH competition. A `development` plant may be used to develop `auto`, a
+`reporting` plant not. M is learned from recorded data of the plant, new for each of {seeds} seeds. The table has
+medians of the executions to 5 % and 1 % of d*, and the best distance found as a median share of d* (least). `scalar`
+uses the distances alone.
 
-{plants}
+{short}
 
-d* is the largest value of three to eight deep searches of the true system. `Spread` is the largest relative difference
-between the best and the third-best of these searches. If it exceeds 1 %, d* is the best value known, and the executions
-to 1 % of it are uncertain.
-
-The next tables give the executions to within 5 % and 1 % of d*: the median, and in parentheses each seed. `> 25` means
-that the campaign was not within the percentage after its budget of 25 executions. `-` means that the campaign has not
-been run. {versions}
-
-{auto}
-
-The other searches use the distances alone:
-
-{others}
-
-{missing}
-"""
+d* is the largest value of three to eight deep searches. On `cart-pole` and `six-joint-arm` these disagree by
+{spread}, so d* is the best value known. Tables: [the plants](tables/searches-plants.csv), [each seed of
+`auto`](tables/searches-plants-auto.csv), [other searches](tables/searches-plants-others.csv)."""
 
 
-def text() -> str:
-    """Return the part; without campaigns it is empty."""
-    if not len(STORED):
-        return ""
-    return TEXT.format(
-        plants=plants_table(),
-        versions=versions_sentence(),
-        auto=table(*auto_table()),
-        others=table(*others_table()),
-        missing=missing_sentence(),
+def part() -> tuple[str, dict[str, Table]]:
+    """Return the part of the page and its tables."""
+    plants = plants_rows()
+    spreads = {row[0]: row[-1] for row in plants}
+    text = TEXT.format(
+        seeds=SEEDS,
+        short=table(["plant", "kind", "tasks", "auto: 5 %", "1 %", "best", "scalar: 5 %", "1 %", "best"], short_rows()),
+        spread=f"{spreads['cart-pole']} and {spreads['six-joint-arm']}",
     )
+    return text, {
+        "searches-plants": (["plant", "kind", "tasks", "budget", "seeds with d*", "d* / median", "spread"], plants),
+        "searches-plants-auto": auto_table(),
+        "searches-plants-others": others_table(),
+    }
+
+
+def short_rows() -> list[list[str]]:
+    """Return medians of `auto`, with the code of today, and of `scalar`."""
+    rows = []
+    for plant in PLANTS.values():
+        row = [plant.name, plant.kind, f"{plant.dimension}-D"]
+        for search, version in (("auto", "after"), ("scalar", UNCHANGED)):
+            found = campaigns(plant, search, version)
+            row += [executions(found, percent, plant.budget).split(" (")[0] for percent in PERCENTS]
+            row.append(best_found(found.values()))
+        rows.append(row)
+    return rows
 
 
 def truths_of(plant: Plant) -> list[dict[str, Any]]:
@@ -60,8 +64,8 @@ def truths_of(plant: Plant) -> list[dict[str, Any]]:
     return list({record["seed"]: record for record in TRUTHS.select(plant=plant.name)}.values())
 
 
-def plants_table() -> str:
-    """Return what the plants are, with their maxima."""
+def plants_rows() -> list[list[str]]:
+    """Return what the plants are, with their maxima and how far deep searches of them disagree."""
     rows = []
     for plant in PLANTS.values():
         records = truths_of(plant)
@@ -71,7 +75,7 @@ def plants_table() -> str:
             f"{min(ratios):.1f} to {max(ratios):.1f}" if ratios else "-",
             f"{max(spread(record['repeats']) for record in records):.1%}" if records else "-",
         ])  # fmt: skip
-    return table(["plant", "kind", "tasks", "budget", "seeds with d*", "d* / median", "spread"], rows)
+    return rows
 
 
 def spread(repeats: list[float]) -> float:
@@ -128,25 +132,3 @@ def others_table() -> tuple[list[str], list[list[Any]]]:
             counts = [executions(found, percent, plant.budget) for percent in PERCENTS]
             rows.append([plant.name, plant.kind, search, *counts, best_found(found.values())])
     return ["plant", "kind", "search", *(f"{percent:g} %" for percent in PERCENTS), "best found: median (least)"], rows
-
-
-def versions_sentence() -> str:
-    """Return which code the versions of `auto` are."""
-    named = {"before": "`before` is the code of commit 85e23b1", "after": "`after` is the code of today"}
-    return f"Of `auto`, {' and '.join(named[version] for version in versions_run())}." if versions_run() else ""
-
-
-def missing_sentence() -> str:
-    """Return which campaigns have not been run; empty if all have."""
-    wanted = [("auto", version) for version in versions_run()]
-    wanted += [(search, UNCHANGED) for search in SEARCHES if search != "auto"]
-    parts = []
-    for search, version in wanted:
-        counts = {plant.name: len(campaigns(plant, search, version)) for plant in PLANTS.values()}
-        few = [f"{name} {count}" for name, count in counts.items() if count < SEEDS]
-        name = search if version == UNCHANGED else f"{search}, {version}"
-        parts += [f"- {name}: {', '.join(few)}"] if few else []
-    if not parts:
-        return ""
-    head = f"Plants with fewer than {SEEDS} seeds so far. `make search` runs those of the code of today. Those of"
-    return "\n".join([head, "`before` need the code of its commit and the option `--version before`.", "", *parts])

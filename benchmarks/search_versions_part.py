@@ -1,29 +1,25 @@
-"""The table of ``docs/searches.md`` that compares `auto` with the code of an earlier commit. Nothing is run here."""
+"""The table of ``docs/searches.md`` on `auto` with the code of an earlier commit. Nothing is run here."""
 
 from __future__ import annotations
 
-from landed import LANDED
-from page_tables import table
 from search_cells import ENDS, cells, results
 from study_auto import CASES, Result, first_within
 
 BEFORE, AFTER = "auto_before", "auto"
 """Files of results: of the code of an earlier commit, and of the code of today."""
 
-TEXT = """The same campaigns with the code of commit {landed} (`before`) and with that of today (`after`), on the seeds
-that both have. The column `fewer / more` counts the seeds in which the code of today needs fewer and more executions to
-1 % of d*. Results of `before` come from a checkout of that commit, with the option `--results` of `study_auto.py`.
-
-{table}
-"""
+HEADER = ["case", "seeds", "code", *ENDS, "fewer / more"]
 
 
-def text() -> str:
-    """Return the part; without campaigns of the earlier code it is empty."""
-    rows = [row for case in CASES for row in rows_of(case)]
-    if not rows:
-        return ""
-    return TEXT.format(landed=LANDED, table=table(["case", "seeds", "code", *ENDS, "fewer / more"], rows))
+def rows() -> list[list[str]]:
+    """Return the campaigns with the code of an earlier commit and with that of today, on the seeds that both have."""
+    return [row for case in CASES for row in rows_of(case)]
+
+
+def total() -> tuple[int, int]:
+    """Return in how many campaigns the code of today needs fewer and more executions to 1 % of d*."""
+    counts = [row[-1].split(" / ") for row in rows() if row[-1]]
+    return sum(int(fewer) for fewer, _ in counts), sum(int(more) for _, more in counts)
 
 
 def rows_of(case: str) -> list[list[str]]:

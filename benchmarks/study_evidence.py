@@ -83,32 +83,32 @@ def before(system: str, seed: int, share: float) -> dict[str, Any] | None:
     return next(iter(calibrate_noise.STORED.select(rule=calibrate_noise.RULE, **same)), None)
 
 
-def table() -> str:
+HEADER = [
+    *("group", "threshold", "campaigns", "validated", "of these, no execution above it", "falsified", "undecided"),
+    *("executions if validated", "bound / truth", "version before: validated, executions"),
+]
+
+
+def rows() -> list[list[str]]:
     """Return how the campaigns of each group ended."""
-    lines = [
-        "| group | threshold | campaigns | validated | without an execution above it | falsified | undecided "
-        "| executions of the validated ones | bound / truth | version before: validated, executions |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    found = []
 
     def middle(values: list[float]) -> str:
         low, half, high = np.quantile(values, [0.0, 0.5, 1.0]) if values else (np.nan,) * 3
         return f"{half:.3g} ({low:.3g} to {high:.3g})" if values else "-"
 
     for group, (share, systems) in GROUPS.items():
-        rows = [row for row in STORED.select(group=group) if row["system"] in systems]
-        if not rows:
-            continue
-        validated = [row for row in rows if row["answer"] == "validated"]
+        lines = [row for row in STORED.select(group=group) if row["system"] in systems]
+        validated = [row for row in lines if row["answer"] == "validated"]
         unseen = sum(row["above"] == 0 for row in validated)
-        counts = [sum(row["answer"] == answer for row in rows) for answer in ("falsified", "undecided")]
-        pairs = [(row, old) for row in rows if (old := before(row["system"], row["seed"], share))]
+        counts = [sum(row["answer"] == answer for row in lines) for answer in ("falsified", "undecided")]
+        pairs = [(row, old) for row in lines if (old := before(row["system"], row["seed"], share))]
         old = [old["executions"] for _, old in pairs if old["answer"] == "validated"]
         compared = f"{len(old)} of {len(pairs)}, {middle(old)}" if pairs else "-"
         executions, bounds = ([row[key] for row in validated] for key in ("executions", "bound"))
-        cells = [group, f"{share:g}", len(rows), len(validated), unseen, *counts, middle(executions), middle(bounds)]
-        lines.append(f"| {' | '.join(map(str, [*cells, compared]))} |")
-    return "\n".join(lines)
+        cells = [group, f"{share:g}", len(lines), len(validated), unseen, *counts, middle(executions), middle(bounds)]
+        found.append([*map(str, cells), compared])
+    return found
 
 
 def main() -> None:
@@ -124,7 +124,8 @@ def main() -> None:
             for system in systems:
                 if (group, system, seed, share) not in known:
                     STORED.append(decide(group, system, seed))
-    print(table())
+    for row in rows():
+        print(*row, sep=" | ")
 
 
 if __name__ == "__main__":

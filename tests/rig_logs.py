@@ -137,42 +137,6 @@ def write_bag1(path: Path, one: Trajectory, *, to_mcap: bool = False) -> None:
         writer.finish()
 
 
-def joint_message() -> Any:
-    """Return a class of protobuf messages with a time stamp, lists, a nested message and an optional field."""
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
-
-    file = descriptor_pb2.FileDescriptorProto(name="cart.proto", package="rig", syntax="proto3")
-    file.dependency.append("google/protobuf/timestamp.proto")
-    part = file.message_type.add(name="Motion")
-    part.field.add(name="position", number=1, type=1, label=3)
-    part.field.add(name="velocity", number=2, type=1, label=1)
-    whole = file.message_type.add(name="Joints")
-    whole.field.add(name="timestamp", number=1, type=11, label=1, type_name=".google.protobuf.Timestamp")
-    whole.field.add(name="motion", number=2, type=11, label=1, type_name=".rig.Motion")
-    whole.field.add(name="effort", number=3, type=1, label=1)
-    whole.field.add(name="count", number=4, type=3, label=1)
-    pool = descriptor_pool.DescriptorPool()
-    pool.AddSerializedFile(timestamp_pb2.DESCRIPTOR.serialized_pb)
-    pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName("rig.Joints"))
-
-
-def write_mcap_protobuf(path: Path, one: Trajectory, *, late: float = 0.0) -> None:
-    """Write the run to MCAP as protobuf messages. Log times are late, time stamps are not."""
-    from mcap_protobuf.writer import Writer
-
-    message_class = joint_message()
-    with path.open("wb") as file, Writer(file) as writer:
-        for k, time in enumerate(one.times):
-            stamp = 5 * 10**9 + round(1e9 * time)
-            message = message_class(effort=one.inputs[k, 0] if k < one.horizon else 0.0, count=k)
-            message.timestamp.seconds, message.timestamp.nanos = stamp // 10**9, stamp % 10**9
-            message.motion.position.append(one.states[k, 0])
-            message.motion.velocity = one.states[k, 1]
-            logged = stamp + round(1e9 * late)
-            writer.write_message(topic="/joints", message=message, log_time=logged, publish_time=stamp)
-
-
 def write_mat(path: Path, one: Trajectory, *, version: str) -> None:
     """Write the run as a MATLAB file: a structure ``log`` with columns, and the inputs as a row."""
     padded = np.append(one.inputs[:, 0], 0.0)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from ctxval.certificates import Forecast, Maxima, Sample, draw_maxima, forecast
+from ctxval.gp.hyperposterior import draw_paths
+from ctxval.learning.actuators import ActuatorSettings
 from ctxval.learning.dynamics_posterior import PosteriorSettings
+from ctxval.learning.dynamics_study import LearningSettings
 from ctxval.learning.hyperparameters import FAMILIES
 from ctxval.learning.worst_case import WorstCaseSettings
-from ctxval.searches.trust_region import FAST
+from ctxval.searches.trust_region import TrustRegionSettings
 
 drawn: dict[tuple[Any, ...], Maxima] = {}
 
@@ -36,7 +40,7 @@ def take_few_draws(replace: Callable[[str, Any], None], *, once: bool = False) -
     replace("ctxval.certificates.posterior.forecast", shorter)
     for module in ("stopping", "posterior", "maxima"):
         replace(f"ctxval.certificates.{module}.draw_maxima", remembered if once else fewer)
-    replace("ctxval.gp.hyperposterior.WAVES", 64)
+    replace("ctxval.certificates.maxima.draw_paths", partial(draw_paths, waves=64))
     replace("ctxval.certificates.maxima._MOST", 1)  # the draws are not doubled where a bound is near the threshold
 
 
@@ -48,7 +52,7 @@ def run_few_loops(replace: Callable[[str, Any], None]) -> None:
     draws = PosteriorSettings(hyperparameters=10, learned_from=40, centres=80, pivots=40, families=FAMILIES[:1])
     replace("ctxval.learning.worst_case.WorstCaseSettings.for_dimension", lambda *_: loops)
     replace("ctxval.learning.dynamics_posterior.PosteriorSettings.for_horizon", lambda *_: draws)
-    replace("ctxval.searches.trust_region._SHARES", (FAST,))
+    replace("ctxval.searches.trust_region.TrustRegion.settings", TrustRegionSettings(shares=(0.15,)))
     # Delays and lags of inputs are looked for in each campaign whose model errs: half of its time.
-    replace("ctxval.learning.actuators._LEARNED_FROM", 40)
-    replace("ctxval.learning.actuators._TRIED", [(1.0, 0.0), (3.0, 0.0), (0.0, 1.5)])
+    actuators = ActuatorSettings(learned_from=40, tried=((1.0, 0.0), (3.0, 0.0), (0.0, 1.5)))
+    replace("ctxval.learning.dynamics_study.LearningSettings", partial(LearningSettings, actuators=actuators))

@@ -325,8 +325,8 @@ def _bag(rng: Rng, folder: Path, number: int) -> tuple[Path, tuple[str, ...], st
     if kind == 3:
         rig_logs.write_bag(folder / "bag", one, late=rng.uniform(0, 0.03, len(one.times)))
         return folder / "bag", cart, "bag with late log times"
-    rig_logs.write_mcap_protobuf(folder / "run.mcap", one, late=float(pick(rng, (0.0, 0.3))))
-    return folder / "run.mcap", ("/joints.motion.position[0]", "/joints.motion.velocity", "/joints.effort"), "protobuf"
+    rig_logs.write_mcap_ros2(folder / "run.mcap", one, late=float(pick(rng, (0.0, 0.3))))
+    return folder / "run.mcap", cart, "ROS 2 in mcap"
 
 
 # Commands, and their answers

@@ -49,8 +49,8 @@ def _sound(kind: str) -> dict[str, bytes]:
                 clothes.rig_logs.write_mcap_json(folder / "run.mcap", one)
             case "mcap ros1":
                 clothes.rig_logs.write_bag1(folder / "run.mcap", one, to_mcap=True)
-            case "mcap protobuf":
-                clothes.rig_logs.write_mcap_protobuf(folder / "run.mcap", one)
+            case "mcap ros2":
+                clothes.rig_logs.write_mcap_ros2(folder / "run.mcap", one)
             case "bag1":
                 clothes.rig_logs.write_bag1(folder / "run.bag", one)
             case "bag2":
@@ -66,7 +66,7 @@ _KINDS: dict[str, Made] = {
     "parquet": ("run.parquet", _COLUMNS),
     "mcap json": ("run.mcap", ("/state.cart.position", "/state.cart.speed[0]", "/command.force")),
     "mcap ros1": ("run.mcap", _CART),
-    "mcap protobuf": ("run.mcap", ("/joints.motion.position[0]", "/joints.motion.velocity", "/joints.effort")),
+    "mcap ros2": ("run.mcap", _CART),
     "bag1": ("run.bag", _CART),
     "bag2": ("bag", _CART),
     "lerobot": ("set", ("observation.state[0]", "observation.state[1]", "action")),

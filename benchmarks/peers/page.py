@@ -10,16 +10,15 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.paper.reproduce.jobs import AUTO, measured_with
-from page_tables import table
+from page_tables import DOCS, GeneratedPage, Table, reflowed, table
 from peers import overhead, run
 from peers.functions import CASES, SEEDS
 from peers.methods import METHODS
-from peers.overhead import COUNTS, SUGGESTIONS
+from peers.overhead import COUNTS
 from peers.run import CUT, Result, applies, budget_of
-from study_auto import ROOT, shown
+from study_auto import shown
 
-PAGE = ROOT / "docs" / "benchmarks.md"
-PICTURES = ROOT / "docs" / "benchmarks"
+PICTURES = DOCS / "benchmarks"
 WITHIN = (5, 2, 1)
 NEVER = float("inf")
 ROUNDING = 1e-4
@@ -86,13 +85,15 @@ def missing(case: str) -> list[str]:
 # Tables
 
 
-def spread(counts: list[float], budget: int) -> str:
-    """Return median, quartiles, and how many of the runs got there."""
+def spread(counts: list[float], budget: int, *, short: bool = False) -> str:
+    """Return the median, the quartiles unless ``short``, and how many of the runs got there."""
     low, high = np.quantile(counts, [0.25, 0.75], method="inverted_cdf")
     reached = int(np.isfinite(counts).sum())
-    if not reached:
+    if not reached and not short:
         return f"- (0/{len(counts)})"
     middle = shown(statistics.median(counts), budget)
+    if short:
+        return f"{middle} ({reached}/{len(counts)})"
     return f"{middle} [{shown(low, budget)}, {shown(high, budget)}] ({reached}/{len(counts)})"
 
 
@@ -111,24 +112,41 @@ def row(cell: Cell) -> list[str]:
     ]
 
 
-def function_section(case: str) -> str:
-    """Return title, table and picture of a function."""
-    found, described = cells(case), CASES[case]
-    title = f"### {described.title}: {described.dimension}-D, {described.budget} executions"
-    if not found:
-        return f"{title}\n\nNot run yet."
-    header = ["method", "input", *(f"to {percent} %" for percent in WITHIN), "mean regret [%]", "CPU s"]
-    parts = [title, seeds_sentence(case, found), table(header, [row(cell) for cell in found])]
-    parts += [f"![Regret against executions](benchmarks/{case}.png)"]
-    return "\n\n".join(parts)
+HEADER = ["function", "method", "input", *(f"to {percent} %" for percent in WITHIN), "mean regret [%]", "CPU s"]
 
 
-def seeds_sentence(case: str, found: list[Cell]) -> str:
-    """Return which seeds there are, what is missing and what broke."""
-    most = max(found, key=lambda cell: len(cell.results))
-    maxima = sorted(result["maximum"] for result in most.results)
-    text = f"{len(most.results)} of {len(SEEDS)} seeds. Their d* are {', '.join(f'{value:.3g}' for value in maxima)}."
-    fewer = [cell for cell in found if len(cell.results) < len(most.results)]
+def function_rows() -> list[list[str]]:
+    """Return what each method needs on each function."""
+    return [[CASES[case].title, *row(cell)] for case in CASES for cell in cells(case)]
+
+
+def functions() -> list[list[str]]:
+    """Return each function with its maxima, and what is special about its runs."""
+    found = []
+    for case, described in CASES.items():
+        of = cells(case)
+        most = max(of, key=lambda cell: len(cell.results))
+        maxima = ", ".join(f"{value:.3g}" for value in sorted(result["maximum"] for result in most.results))
+        notes = special(case, of, len(most.results))
+        found.append([described.title, f"{described.dimension}-D", str(described.budget), maxima, notes])
+    return found
+
+
+def short_rows() -> list[list[str]]:
+    """Return medians of the executions to 5 % on each function, and CPU seconds of a suggestion."""
+    rows = []
+    for name, method in METHODS.items():
+        own = {case: cell for case in CASES for cell in cells(case) if cell.method == name}
+        if own:
+            counts = [spread(own[c].first_within(5), own[c].budget, short=True) if c in own else "-" for c in CASES]
+            rows.append([method.title, *counts, overhead_cell("linear-10", name, 100)])
+    return rows
+
+
+def special(case: str, found: list[Cell], seeds: int) -> str:
+    """Return which runs are missing, which had less budget, and which failed."""
+    text = ""
+    fewer = [cell for cell in found if len(cell.results) < seeds]
     if fewer:
         names = (f"{METHODS[cell.method].title} ({len(cell.results)})" for cell in fewer)
         text += f" These have only the first seeds: {', '.join(names)}."
@@ -137,7 +155,7 @@ def seeds_sentence(case: str, found: list[Cell]) -> str:
         text += f" One of the methods found {100 * excess:.2g} % more than the value used for d*."
     if missing(case):
         text += f" Not run: {', '.join(missing(case))}."
-    return text + "".join(limits_sentence(cell) for cell in found)
+    return (text + "".join(limits_sentence(cell) for cell in found)).strip()
 
 
 def limits_sentence(cell: Cell) -> str:
@@ -173,14 +191,13 @@ def paired(case: str, name: str, other: str) -> list[tuple[float, float]]:
     return [(counts[name, s], counts[other, s]) for s in SEEDS if (name, s) in counts and (other, s) in counts]
 
 
-def pairs_table() -> str:
-    """Return every method against our scalar search and against ``auto``, run by run."""
-    rows = [
+def pairs() -> list[list[str]]:
+    """Return every method in comparison with our scalar search and with ``auto``, run by run."""
+    return [
         [method.title, method.given, against(name, "scalar"), against(name, "auto")]
         for name, method in METHODS.items()
         if any(cell.method == name for case in CASES for cell in cells(case))
     ]
-    return table(["method", "input", "compared with ours: scalar", "compared with ours: auto"], rows)
 
 
 # Overhead
@@ -205,7 +222,7 @@ def overhead_cell(case: str, name: str, n: int) -> str:
     return (found["error"] or "-") if mean is None else f"{mean:.2g}"
 
 
-def overhead_table(case: str, names: Iterable[str], counts: tuple[int, ...]) -> str:
+def overhead_rows(case: str, names: Iterable[str], counts: tuple[int, ...]) -> list[list[str]]:
     """Return CPU seconds of a suggestion and the memory of the process, method by method."""
     rows = []
     for name in names:
@@ -213,7 +230,7 @@ def overhead_table(case: str, names: Iterable[str], counts: tuple[int, ...]) -> 
             memory = [found["memory"] for n in counts if (found := measured(case, name, n)) and "memory" in found]
             cells_ = [overhead_cell(case, name, n) for n in counts]
             rows.append([METHODS[name].title, *cells_, f"{max(memory):.0f}" if memory else "-"])
-    return table(["method", *(f"n = {n} [CPU s]" for n in counts), "peak memory [MB]"], rows)
+    return rows
 
 
 def target(text: str, asked: float, value: float | None) -> list[str]:
@@ -223,10 +240,10 @@ def target(text: str, asked: float, value: float | None) -> list[str]:
     return [text, f"{asked:g}", f"{value:.3g}", "met" if value <= asked else "**missed**"]
 
 
-def targets_table() -> str:
-    """Return what was asked of the overhead beside what was measured."""
+def targets() -> list[list[str]]:
+    """Return the requested CPU seconds and the measured ones."""
     ours, theirs = seconds("linear-10", "scalar", 100), seconds("linear-10", "botorch-log-ei", 100)
-    rows = [
+    return [
         target("scalar, n = 100 in 20-D, fraction of BoTorch LogEI", 0.05, ours / theirs if ours and theirs else None),
         target("scalar, n = 100 in 20-D, CPU s", 0.1, ours),
         target("scalar, n = 1,000 in 20-D, CPU s", 2.0, seconds("linear-10", "scalar", 1000)),
@@ -236,87 +253,64 @@ def targets_table() -> str:
             for n in (20, 100)
         ),
     ]
-    return table(["quantity", "at most", "measured", ""], rows)
 
 
 TEXT = """# Comparison with other tools
 
-Generated by `make bench-peers` from the results in `benchmarks/results/peers.jsonl` and `peers_overhead.jsonl`;
-nothing here is written by hand. {measured}
+Generated by `make bench-peers` from the stored results in `benchmarks/results/`. {measured}
 
 We know of no other tool that takes a system, a model and a controller designed on the model. The tools on this page
-have one task in common with `ctxval`: they search for the largest value of a function in few evaluations. Each of them
-is therefore given d(p), as a function of the unit cube, to maximise.
-
-None of these tools learns from trajectories, but others do: FReaK, ARIsTEO and their successors learn a model of the
-system from simulations, and search on it for a violation of a requirement. [searches.md](searches.md) states what their
-authors report. They need a requirement in temporal logic and a system whose controller does not depend on the task, so
-they are not run here.
+share one task with `ctxval`: they search for the largest value of a function in few evaluations. So each of them
+maximises d(p) on the unit cube. Tools that learn from trajectories need a requirement in temporal logic and a
+controller that does not depend on the task; they were not run
+([searches](searches.md#falsification-that-learns-from-trajectories)).
 
 ## Method
 
-The functions are the cases of `ctxval.cases`. The model and its data are drawn anew for each seed, and all methods have
-the same seeds. d* is known in closed form for the linear systems. It is computed on a dense grid for pendulum and arm,
-and by differential evolution and local search for the Dubins car. For arm and car it is the best known value. A run
-ends within 1 % of d* or when its budget is spent. The first points are counted. If a method is deterministic, as DIRECT
-is, seeds differ only in their functions. The training of the arm's network amplifies rounding, so its functions depend
-on the processor. All methods on this page had the same functions, which `OPENBLAS_CORETYPE=SkylakeX` reproduces; those
-of [searches.md](searches.md) are others.
+The functions are the cases of `ctxval.cases`, with a new model and new data for each of {seeds} seeds, the same for
+all methods. d* is exact for linear systems, computed on a dense grid for pendulum and arm, and the best known value
+for the Dubins car. A run ends within 1 % of d* or when its budget is spent; the first points are counted. The
+training of the arm's network amplifies rounding, so its functions depend on the processor
+(`OPENBLAS_CORETYPE=SkylakeX` reproduces them).
 
-The columns of the tables are:
+Most methods receive a distance from each execution. `vector` receives the vector whose norm is the distance, and
+`auto` the trajectory; it may run M, and has the data that M was learned from, unless it says "without data". So
+`auto` shows the value of trajectories, and `scalar` the performance without them. VerifAI's cross-entropy and bandit
+learn only from counterexamples: they are told that tasks above d* / 2 are some, which is unknown in practice. TuRBO
+was written on BoTorch according to its paper. [Settings of each method](tables/benchmarks-settings.csv). VerifAI and
+PSY-TaLiRo need different versions of `attrs`, so there are two dependency groups, `peers` and `peers-verifai`.
 
-- **To 5, 2, 1 %**: executions until the largest distance found is within this percentage of d*. The entry is the median
-  over the seeds, the quartiles in brackets, and the number of seeds that reached it within the budget.
-- **Mean regret**: the area under the regret curve over the budget. The regret is `1 - best / d*` in per cent, and a run
-  that has ended keeps its last regret. The entry is the median over the seeds with quartiles.
-- **CPU s**: processor seconds for one suggestion in these runs, over all threads, with BLAS and torch on one thread. It
-  includes everything but the execution. Other programs ran on the machine, so compare only the orders of magnitude.
-  Some runs of `auto` are the same campaigns as in `study_auto.py`, and their time includes the executions.
-- **Input**: what a method receives from an execution. Most methods receive the distance, a number. `vector` receives
-  the vector whose norm is the distance, if there is one. `auto` receives the whole trajectory and may run M. If M was
-  learned from data, `auto` also receives these data, which are executions of S that were made before; it is also run
-  without them. A comparison of `auto` with the other methods shows the value of the trajectories. A comparison of
-  `scalar` with the other methods shows the performance without them.
+## Executions and computing time
 
-{settings}
+Executions to 5 % of d*: medians over the seeds, with the number of seeds that reached it within the budget
+({budgets}). The last column has CPU seconds of a suggestion in 20-D after 100 values.
 
-VerifAI and PSY-TaLiRo need different versions of `attrs` and cannot be installed together. There are therefore two
-dependency groups, `peers` and `peers-verifai`.
-
-## Run-by-run comparison
-
-The table compares each method with two searches of `ctxval`, over all functions and seeds that both have. It gives the
-number of runs in which the method was within 1 % of d* after fewer / equally many / more executions than the search of
-`ctxval`. If neither was within 1 %, the run counts as equal. If the budgets differ, the smaller one applies to both.
-
-{pairs}
+{short}
 
 ![Executions until within 5 %](benchmarks/executions.png)
 
-## Results for each function
+- `auto` and `scalar` came within 1 % of d* at different times in most of the runs that both have: `auto` was earlier
+  / equal / later in {auto_scalar} runs. GPyOpt, the paper's tool, in comparison with `auto`: {gpyopt_auto}.
+- `scalar` is a Bayesian optimisation like others. In comparison with it, GPyOpt was earlier / equal / later in
+  {gpyopt_scalar} runs, BoTorch LogEI in {log_ei_scalar} and EGObox in {egobox_scalar}. On the arm, methods that see
+  only distances often end in a local maximum.
+- {met} of {asked} targets of computing time are met ([targets](tables/benchmarks-targets.csv)).
 
-{functions}
-
-## Computing time of a suggestion
-
-The table gives CPU seconds of a suggestion on the linear system with 10 states, 20-D. It is the mean of {suggestions}
-successive suggestions after n values. Methods that build a model are given the same n uniformly random tasks, and they
-first learn from these. All other methods use their own history. TuRBO makes its first 40 suggestions without a model.
-The memory is the peak of a separate process that does nothing else, including Python and the case. Other programs ran
-on the same cores, and this lengthens all times. The rows of `auto`, EGObox and bayesian-optimization are from a faster
-computer, on which `scalar` and GP-UCB took 0.62 to 0.75 of the time in the table.
-
-{overhead}
+Other programs ran on the machine, so compare only orders of magnitude of times. The rows of `auto`, EGObox and
+bayesian-optimization are from a faster computer, on which `scalar` and GP-UCB took 0.62 to 0.75 of the time in the
+table.
 
 ![CPU seconds of a suggestion](benchmarks/overhead.png)
 
-On the Dubins car, the inner loop designs controllers and simulates them:
+Tables: [each function with quartiles, regret and CPU time](tables/benchmarks-functions.csv), [the functions, their
+d* and exceptions](tables/benchmarks-cases.csv), [run by run](tables/benchmarks-pairs.csv), [CPU time and
+memory](tables/benchmarks-overhead.csv), [on the Dubins car](tables/benchmarks-overhead-dubins.csv).
 
-{dubins}
+## Regret of each function
 
-## Targets
+The regret is `1 - best / d*`, as medians over the seeds.
 
-{targets}
+{pictures}
 """
 
 SETTINGS = [
@@ -354,34 +348,57 @@ SETTINGS = [
         "VerifAI 2.2.0",
         "default settings; its Bayesian optimisation is GPyOpt's expected improvement, which is learned anew each "
         "time. Cross-entropy and bandit learn only from counterexamples. They are told that tasks above d* / 2 are "
-        "counterexamples, which nobody knows in practice. Simulated annealing raises an error as released and is left "
+        "counterexamples, which is unknown in practice. Simulated annealing raises an error as released and is left "
         "out",
     ],
     ["PSY-TaLiRo 3.2.0", "both of its optimisers; its annealing makes no local searches"],
 ]
 
 
-def text() -> str:
-    """Return the page."""
-    return TEXT.format(
+def page() -> GeneratedPage:
+    """Return the page and its tables."""
+    asked = targets()
+    text = TEXT.format(
         measured=measured_with(run.STORED.values(), AUTO),
-        settings=table(["method", "settings"], SETTINGS),
-        pairs=pairs_table(),
-        functions="\n\n".join(function_section(case) for case in CASES),
-        suggestions=SUGGESTIONS,
-        overhead=overhead_table("linear-10", METHODS, (*COUNTS, 1000)),
-        dubins=overhead_table("dubins-basin", ("auto", "auto-no-data", "scalar"), (20, 100)),
-        targets=targets_table(),
+        seeds=len(SEEDS),
+        budgets=", ".join(f"{described.budget}" for described in CASES.values()),
+        short=table(
+            ["method", *(f"{case.title}, {case.dimension}-D" for case in CASES.values()), "CPU s"], short_rows()
+        ),
+        auto_scalar=against("auto", "scalar"),
+        gpyopt_auto=against("gpyopt", "auto"),
+        gpyopt_scalar=against("gpyopt", "scalar"),
+        log_ei_scalar=against("botorch-log-ei", "scalar"),
+        egobox_scalar=against("egobox", "scalar"),
+        met=sum(row[-1] == "met" for row in asked),
+        asked=len(asked),
+        pictures="\n\n".join(f"![{CASES[case].title}](benchmarks/{case}.png)" for case in CASES),
     )
+    counts, memory = (*COUNTS, 1000), "peak memory [MB]"
+    tables: dict[str, Table] = {
+        "benchmarks-settings": (["method", "settings"], SETTINGS),
+        "benchmarks-functions": (HEADER, function_rows()),
+        "benchmarks-cases": (["function", "tasks", "budget", "d* of the seeds", "exceptions"], functions()),
+        "benchmarks-pairs": (["method", "input", "compared with scalar", "compared with auto"], pairs()),
+        "benchmarks-overhead": (
+            ["method", *(f"n = {n} [CPU s]" for n in counts), memory],
+            overhead_rows("linear-10", METHODS, counts),
+        ),
+        "benchmarks-overhead-dubins": (
+            ["method", "n = 20 [CPU s]", "n = 100 [CPU s]", memory],
+            overhead_rows("dubins-basin", ("auto", "auto-no-data", "scalar"), (20, 100)),
+        ),
+        "benchmarks-targets": (["quantity", "at most", "measured", ""], asked),
+    }
+    return GeneratedPage("benchmarks.md", reflowed(text), tables)
 
 
 def main() -> None:
-    """Write the page and its pictures."""
+    """Write the page, its tables and pictures."""
     from peers.pictures import draw  # here, as the text needs no pictures
 
     draw()
-    PAGE.write_text(text())
-    print(f"page: {PAGE.relative_to(ROOT)}")
+    page().write()
 
 
 if __name__ == "__main__":

@@ -25,11 +25,6 @@ from study_auto import experiment  # noqa: E402
 HERE = ("auto", "vector", "scalar", "gp-ucb", "cma-es", "dual-annealing", "direct", "random")
 
 
-@pytest.mark.thorough  # test_study_pages.py does the same
-def test_the_page_is_what_the_stored_results_give() -> None:
-    assert page.PAGE.read_text() == page.text()
-
-
 @pytest.mark.parametrize("case", [case for case in CASES if page.cells(case)])
 def test_every_function_with_results_has_a_picture(case: str) -> None:
     assert (page.PICTURES / f"{case}.png").exists()

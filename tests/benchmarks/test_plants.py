@@ -280,11 +280,12 @@ def test_a_campaign_is_run_once_and_only_auto_has_versions(tmp_path: Path) -> No
 
 
 def test_the_page_lists_every_plant_and_every_seed() -> None:
-    text = search_plants_part.text()
+    text, tables = search_plants_part.part()
     head, rows = search_plants_part.auto_table()
     assert [row[0] for row in rows] == list(PLANTS)
     assert head[2] == "5 %, before"
     assert all(name in text for name in PLANTS)
+    assert len(tables["searches-plants-others"][1]) == 3 * len(PLANTS)
     assert search_plants_part.executions({}, 5.0, 25) == "-"
     one = {
         0: {"truth": 1.0, "distances": [0.5, 0.96], "budget": 25},

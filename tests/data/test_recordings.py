@@ -13,7 +13,7 @@ import pytest
 
 from ctxval import Trajectory
 from ctxval.data import LogMapping, Recordings, read_logs, read_recordings
-from ctxval.data.messages import ros1_decoder
+from ctxval.data.messages import ros_decoder
 from ctxval.errors import InputError
 from rig_logs import (
     DT,
@@ -23,7 +23,6 @@ from rig_logs import (
     write_lerobot,
     write_mat,
     write_mcap_json,
-    write_mcap_protobuf,
     write_mcap_ros2,
     write_parquet,
 )
@@ -37,12 +36,6 @@ CART = LogMapping.from_table(
 JOINTS = LogMapping.from_table(
     {
         "states": {"position": "/joints.position[0]", "speed": "/joints.velocity[0]"},
-        "inputs": {"force": "/joints.effort"},
-    }
-)
-PROTOBUF = LogMapping.from_table(
-    {
-        "states": {"position": "/joints.motion.position[0]", "speed": "/joints.motion.velocity"},
         "inputs": {"force": "/joints.effort"},
     }
 )
@@ -66,7 +59,6 @@ WRITTEN: dict[str, tuple[Callable[[Path, Trajectory], None], LogMapping | None]]
     "bag": (write_bag, JOINTS),
     "ros1.bag": (write_bag1, JOINTS),
     "ros1.mcap": (lambda path, one: write_bag1(path, one, to_mcap=True), JOINTS),
-    "protobuf.mcap": (write_mcap_protobuf, PROTOBUF),
     "bag of mcap": (lambda path, one: write_bag(path, one, storage="mcap"), JOINTS),
     "level5.mat": (lambda path, one: write_mat(path, one, version="5"), MATLAB),
     "level73.mat": (lambda path, one: write_mat(path, one, version="7.3"), MATLAB),
@@ -331,23 +323,18 @@ def test_a_missing_library_is_named_with_its_extra(tmp_path: Path) -> None:
     assert said.strip() == "Parquet files need pyarrow: pip install 'ctxval[logs]'."
 
 
-def test_the_stamps_in_messages_of_protobuf_and_of_ros_1_are_times_too(tmp_path: Path) -> None:
+def test_the_stamps_in_messages_of_ros_1_are_times_too(tmp_path: Path) -> None:
     one = run(4)
-    write_mcap_protobuf(tmp_path / "a.mcap", one, late=0.25)
     write_bag1(tmp_path / "b.bag", one)
-    for name in ("a.mcap", "b.bag"):
-        (log,) = read_logs([tmp_path / name])
-        clock = LogMapping.from_table({"states": ["x"], "stamp": "header"}).clock
-        times = log.signals(["/joints.effort"], clock)["/joints.effort"].times
-        np.testing.assert_allclose(times, one.times, atol=1e-9)
+    (log,) = read_logs([tmp_path / "b.bag"])
+    clock = LogMapping.from_table({"states": ["x"], "stamp": "header"}).clock
+    times = log.signals(["/joints.effort"], clock)["/joints.effort"].times
+    np.testing.assert_allclose(times, one.times, atol=1e-9)
 
 
-def test_the_fields_of_protobuf_and_ros_1_are_listed_if_one_is_missing(tmp_path: Path) -> None:
-    write_mcap_protobuf(tmp_path / "a.mcap", run(4))
+def test_the_fields_of_ros_1_are_listed_if_one_is_missing(tmp_path: Path) -> None:
     write_bag1(tmp_path / "b.bag", run(4))
     wrong = LogMapping.from_table({"states": ["/joint.angle"]})
-    with pytest.raises(InputError, match=r"/joints.motion.position\[0\], /joints.motion.velocity, /joints.effort"):
-        read_recordings([tmp_path / "a.mcap"], wrong)
     with pytest.raises(InputError, match=r"/joints.header.stamp.sec.*, /joints.position\[0\], /joints.velocity"):
         read_recordings([tmp_path / "b.bag"], wrong)
 
@@ -368,48 +355,76 @@ def test_a_damaged_message_is_named(tmp_path: Path) -> None:
         read_recordings([tmp_path / "text.bag"], JOINTS)
 
 
-def test_every_type_of_ros_1_is_decoded_as_rosbags_encodes_it() -> None:
+@pytest.mark.parametrize("version", [1, 2])
+def test_every_type_of_ros_is_decoded_as_rosbags_encodes_it(version: int) -> None:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    definition = """bool a
+    moments = (
+        ("time h", "duration i") if version == 1 else ("builtin_interfaces/Time h", "builtin_interfaces/Duration i")
+    )
+    of_moments = (
+        ""
+        if version == 1
+        else f"""
+{"=" * 80}
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+{"=" * 80}
+MSG: builtin_interfaces/Duration
+int32 sec
+uint32 nanosec
+"""
+    )
+    definition = f"""bool a
 byte b
 char c
 int16 d
 uint64 e
 float32 f
 string g
-time h
-duration i
+{moments[0]}
+{moments[1]}
 float64[3] j
 string[] k
 Part[] l
 uint8[] m
 int32 CONSTANT=7
-================================================================================
+{"=" * 80}
 MSG: rig/Part
 int8 x
 float64[] y
-"""
-    store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg(definition, "rig/msg/All"))
+{of_moments}"""
+    store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+    store.register(
+        {name: fields for name, fields in get_types_from_msg(definition, "rig/msg/All").items() if name[:3] == "rig"}
+    )
     types = store.types
     clock, lasting = types["builtin_interfaces/msg/Time"], types["builtin_interfaces/msg/Duration"]
     parts = [types["rig/msg/Part"](x=-1, y=np.array([0.5])), types["rig/msg/Part"](x=2, y=np.array([]))]
     message = types["rig/msg/All"](
-        *(True, -3, 200, -300, 2**63, 0.25, "caf\u00e9", clock(2_000_000_000, 5), lasting(-6, 7)),
+        *(True, 3 - 6 * (version == 1), 200, -300, 2**63, 0.25, "caf\u00e9", clock(1_000_000_000, 5), lasting(-6, 7)),
         *(np.array([1.0, 2.0, 3.0]), ["a", ""], parts, np.array([1, 2], dtype=np.uint8)),
     )
-    data = bytes(store.serialize_ros1(message, "rig/msg/All"))
-    found = ros1_decoder("rig/msg/All", definition.encode())(data)
+    encode = store.serialize_ros1 if version == 1 else store.serialize_cdr
+    data, decode = (
+        bytes(encode(message, "rig/msg/All")),
+        ros_decoder("rig/msg/All", definition.encode(), aligned=version == 2),
+    )
+    found = decode(data)
     plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in found.items()}
     parts_found = [{"x": one["x"], "y": one["y"].tolist()} for one in plain.pop("l")]
     assert parts_found == [{"x": -1, "y": [0.5]}, {"x": 2, "y": []}]
-    times = {"h": {"sec": 2_000_000_000, "nanosec": 5}, "i": {"sec": -6, "nanosec": 7}}
-    numbers = {"a": True, "b": -3, "c": 200, "d": -300, "e": 2**63, "f": 0.25, "g": "caf\u00e9"}
+    times = {"h": {"sec": 1_000_000_000, "nanosec": 5}, "i": {"sec": -6, "nanosec": 7}}
+    numbers = {"a": True, "b": 3 - 6 * (version == 1), "c": 200, "d": -300, "e": 2**63, "f": 0.25, "g": "caf\u00e9"}
     assert plain == {**numbers, **times, "j": [1, 2, 3], "k": ["a", ""], "m": [1, 2]}
     for size in range(len(data)):
         with pytest.raises(ValueError, match=r"shorter than its definition|longer than its message"):
-            ros1_decoder("rig/msg/All", definition.encode())(data[:size])
+            decode(data[:size])
+    if version == 2:
+        large = bytes(store.serialize_cdr(message, "rig/msg/All", little_endian=False))
+        assert large != data
+        assert str(decode(large)) == str(found)
 
 
 def test_a_definition_that_cannot_be_read_is_named(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from ctxval.errors import InputError
 from ctxval.gp import regression
 from ctxval.gp.cholesky import pivoted_cholesky, pivoted_rows
 from ctxval.gp.kernels import Matern
-from ctxval.gp.surrogate import LONG, SurrogateHyperparameters, fit_surrogate, kept_rows, learn
+from ctxval.gp.surrogate import SurrogateHyperparameters, fit_surrogate, kept_rows, learn
 from rig_thorough import more
 
 
@@ -190,8 +190,8 @@ def long_history(count: int, dimension: int = 2, failed: int = 0) -> tuple[Array
 
 
 def test_all_of_a_short_history_is_kept() -> None:
-    points, values = long_history(LONG - 1, failed=100)
-    np.testing.assert_array_equal(kept_rows(points, values, 10), np.arange(LONG - 1))
+    points, values = long_history(999, failed=100)
+    np.testing.assert_array_equal(kept_rows(points, values, 10), np.arange(999))
 
 
 @pytest.mark.parametrize("failed", [0, 500, 2998])
@@ -209,7 +209,7 @@ def test_a_long_history_keeps_the_largest_and_the_latest_and_is_covered(failed: 
 
 
 def test_copies_of_one_point_are_no_reason_to_stop() -> None:
-    points, values = np.full((LONG, 3), 0.5), np.zeros(LONG)
+    points, values = np.full((1000, 3), 0.5), np.zeros(1000)
     assert len(np.unique(kept_rows(points, values, 900))) == 900
 
 
@@ -219,13 +219,13 @@ def test_copies_of_one_point_are_no_reason_to_stop() -> None:
     [("gp-ucb", 2), *more(("bayesian-optimisation", 6), ("bayesian-optimisation", 20), *UNCUT)],
 )
 def test_a_search_goes_on_over_a_long_history_as_one_never_stopped(name: str, dimension: int) -> None:
-    points, values = long_history(LONG + 3, dimension, failed=50)
+    points, values = long_history(1003, dimension, failed=50)
 
     def asked() -> Array:
         search = searches.by_name(name)
         search.reset(dimension, 4)
-        search.tell(points[: LONG - 2], values[: LONG - 2])
-        search.tell(points[LONG - 2 :], values[LONG - 2 :])
+        search.tell(points[:998], values[:998])
+        search.tell(points[998:], values[998:])
         proposed = search.ask(2)
         assert ((proposed >= 0) & (proposed <= 1)).all()
         assert cdist(proposed, points).min() > 1e-6
@@ -238,7 +238,7 @@ def test_a_search_goes_on_over_a_long_history_as_one_never_stopped(name: str, di
 @pytest.mark.parametrize("name", ["gp-ucb", *more("bayesian-optimisation")])
 def test_a_long_history_leads_to_the_maximum_too(name: str) -> None:
     rng = np.random.default_rng(1)
-    points = rng.random((LONG + 100, 2)) * [0.6, 1.0]  # the peak is where none of them is
+    points = rng.random((1100, 2)) * [0.6, 1.0]  # the peak is where none of them is
     search = searches.by_name(name)
     search.reset(2, 0)
 

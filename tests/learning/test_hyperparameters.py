@@ -14,8 +14,8 @@ from ctxval._util.arrays import Array
 from ctxval.errors import InputError
 from ctxval.learning.hyperparameters import (
     FAMILIES,
-    NOISE,
     HyperparameterPosterior,
+    HyperparameterPrior,
     ResidualHyperparameters,
     ResidualKernel,
     _resampled,
@@ -25,6 +25,7 @@ from ctxval.learning.hyperparameters import (
 )
 
 KERNEL = ResidualKernel(2.5, 1.0, 1)
+LEAST, MOST = HyperparameterPrior().noise_bounds
 PARAMETERS = np.log([1.5, 0.7, 2.0, 0.3, 0.01])
 
 
@@ -85,7 +86,10 @@ def test_the_gradient_is_that_of_finite_differences(nu: float, growth: float) ->
 def test_beyond_the_bounds_only_the_prior_changes() -> None:
     Z, Y = observations()
     bound, beyond = PARAMETERS.copy(), PARAMETERS.copy()
-    bound[-1], beyond[-1] = np.log(NOISE[0]), np.log(NOISE[0]) - 3
+    bound[-1], beyond[-1] = (
+        np.log(LEAST),
+        np.log(LEAST) - 3,
+    )
     difference = log_posterior(KERNEL, beyond, Z, Y)[0] - log_posterior(KERNEL, bound, Z, Y)[0]
     assert difference == pytest.approx(log_prior(beyond) - log_prior(bound))
 
@@ -165,7 +169,7 @@ def test_draws_of_the_prior_have_its_medians_within_the_bounds() -> None:
     np.testing.assert_allclose(theta[:, :3].std(axis=0), 1, atol=0.05)
     low, high = (ends[:-1] for ends in ResidualKernel(2.5, 0.0, 1).box(3))
     assert ((theta >= low) & (theta <= high)).all()
-    assert all(0.999 * NOISE[0] < one.noise < 1.001 * NOISE[1] for one in drawn)
+    assert all(0.999 * LEAST < one.noise < 1.001 * MOST for one in drawn)
     families = [(one.kernel.nu, one.kernel.growth) for one in drawn]
     assert [families.count(family) / 3000 for family in FAMILIES] == pytest.approx([1 / 3] * 3, abs=0.04)
 

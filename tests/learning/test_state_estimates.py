@@ -28,7 +28,7 @@ def test_rates_are_estimated_as_well_as_the_records_allow(resolution: float, noi
     y = truth[:, :1] + noise * rng.normal(size=(len(truth), 1))
     y = np.round(y / resolution) * resolution if resolution else y
     steps = np.diff(truth, axis=0).std(axis=0)
-    estimates, errors = smoothed_states(Swing(), Outputs([0]), truth[0], y, inputs, steps)
+    estimates, errors = smoothed_states(Swing(), Outputs([0]), truth[0], y, inputs, steps, np.logspace(0, -4, 5))
     assert estimates[..., :1] == pytest.approx(np.repeat(y[:, None], len(errors), axis=1), abs=1e-9)
     of_rate = np.sqrt(((estimates[:, :, 1] - truth[:, None, 1]) ** 2).mean(axis=0)) / truth[:, 1].std()
     chosen = int(errors[:, 0].argmin())

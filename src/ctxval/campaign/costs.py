@@ -22,7 +22,6 @@ from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.learning import DynamicsStudy
 from ctxval.searches import Auto, Costs, Prediction
-from ctxval.searches.trust_region import FAST
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,8 @@ class ThinkingCosts:
         search = Auto("thorough")
         search.reset(validation.space.dimension, 0)
         designs = search.designs(prediction)
-        thorough, fast = (search.thinking_seconds(costs, number) for number in (designs, round(FAST * designs)))
+        fewest = round(search.settings.shares[-1] * designs)
+        thorough, fast = (search.thinking_seconds(costs, number) for number in (designs, fewest))
         return cls(design, loop, choice, verdict, learning + thorough, designs, learning + fast)
 
 

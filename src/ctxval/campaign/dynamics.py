@@ -28,7 +28,6 @@ from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.coverage import unsampled_corner
-from ctxval.learning.precision import SHARE
 from ctxval.learning.prediction import Executed
 from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
@@ -101,7 +100,8 @@ class CampaignDynamics:
     def _allowed(self, trials: Sequence[Trial]) -> float:
         """Return the distance that is negligible beside all stated thresholds; 0 if executed ones are larger."""
         least = min((stated.threshold for stated in self._store.thresholds() or ()), default=0.0)
-        return SHARE * least if Trials(trials).largest <= SHARE * least else 0.0
+        allowed = self.study.settings.agreement.share * least
+        return allowed if Trials(trials).largest <= allowed else 0.0
 
     def regular(self, trials: Sequence[Trial]) -> LearnedDynamics | None:
         """Return what the regular transitions of the completed trials teach; None if there are no irregular ones."""

@@ -269,7 +269,7 @@ class Message(ShortRepr):
     topic: str
     logged: int  #: when it was recorded, nanoseconds
     published: int  #: when it was sent, nanoseconds
-    content: Any  #: a mapping, or an object with an attribute for each field
+    content: Any  #: nested mappings and lists
 
 
 class TopicLog(Log):
@@ -356,7 +356,7 @@ class TopicLog(Log):
 def _header(content: Any) -> int | None:
     """Return the ``header.stamp`` or the ``timestamp`` in a message, nanoseconds; None if there is none."""
     stamp = _first(content, ("header", "stamp"), ("timestamp",))
-    whole, part = _first(stamp, ("sec",), ("seconds",)), _first(stamp, ("nanosec",), ("nsec",), ("nanos",))
+    whole, part = _first(stamp, ("sec",)), _first(stamp, ("nanosec",), ("nsec",))
     return None if whole is None or part is None else int(whole) * 10**9 + int(part)
 
 
@@ -376,11 +376,8 @@ def _resolved(content: Any, path: Sequence[str | int]) -> Any:
         match step, content:
             case int(), _:
                 content = content[step] if hasattr(content, "__getitem__") and step < len(content) else None
-            case _, Mapping():
-                content = content.get(step)
             case _:
-                # Only fields that the message's class declares: attributes of Python are not data.
-                content = getattr(content, step, None) if step in getattr(type(content), "__slots__", ()) else None
+                content = content.get(step) if isinstance(content, Mapping) else None
     return content
 
 
@@ -403,14 +400,9 @@ def _numeric_fields(content: Any, before: str = "", depth: int = 6) -> Iterator[
     match content:
         case int() | float() | np.number():
             yield before
-        case str() | bytes():
-            return
         case Mapping():
             parts = ((f"{before}.{name}", part) for name, part in content.items())
         case list() | tuple() | np.ndarray():
             parts = ((f"{before}[{index}]", part) for index, part in enumerate(content[:16]))
-        case _:
-            names = getattr(type(content), "__slots__", ())
-            parts = ((f"{before}.{name}", getattr(content, name)) for name in names)
     for path, part in parts if depth else ():
         yield from _numeric_fields(part, path.removeprefix("."), depth - 1)

@@ -1,9 +1,9 @@
 """Logs of messages: MCAP files and bags of ROS 1 and 2. Needs the extra ``logs``, and no ROS.
 
 The definitions of messages in a file are interpreted; nothing in it is ever run. The decoders of genpy and rosbags
-compile Python code from these definitions. For ROS 1, rosbags only parses them here. Its format: little-endian numbers
-without padding; strings and lists begin with their length as a uint32 (http://wiki.ros.org/msg). Messages of ROS 2 are
-decoded by mcap-ros2-support, and protobuf by mcap-protobuf-support.
+compile Python code from these definitions, so rosbags only parses them here. Messages of ROS 1 are numbers without
+padding; strings and lists begin with their length as a uint32 (http://wiki.ros.org/msg). Those of ROS 2, in CDR, begin
+with four bytes, numbers are aligned to their size, and strings end with a NUL byte (OMG, DDS-XTypes 1.3, section 7.4).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import io
 import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import IO, Any
@@ -73,7 +73,7 @@ class _FileOfMessages(TopicLog):
 
 
 class McapLog(_FileOfMessages):
-    """An MCAP file with messages in JSON, in protobuf or of ROS 1 and 2."""
+    """An MCAP file with messages in JSON or of ROS 1 and 2."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -122,13 +122,13 @@ class McapLog(_FileOfMessages):
                         yield Message(channel.topic, record.log_time, record.publish_time, content)
 
     def _definition(self, schema: Any, channel: Any) -> Definition:
-        encoding = getattr(schema, "encoding", None)
-        if channel.message_encoding == "json":
-            return json_decoder, "", b""
-        if (make := _DECODERS.get((channel.message_encoding, encoding))) is not None:
-            return make, schema.name, schema.data
-        of = channel.message_encoding + ("" if schema is None else f" with a schema in {encoding}")
-        known = "messages in json, in protobuf, in cdr with ros2msg and in ros1 with ros1msg can be read"
+        match channel.message_encoding, getattr(schema, "encoding", None):
+            case "json", _:
+                return json_decoder, "", b""
+            case ("cdr", "ros2msg") | ("ros1", "ros1msg") as kinds:
+                return partial(ros_decoder, aligned=kinds[0] == "cdr"), schema.name, schema.data
+        of = channel.message_encoding + ("" if schema is None else f" with a schema in {schema.encoding}")
+        known = "messages in json, in cdr with ros2msg and in ros1 with ros1msg can be read"
         raise InputError(f"{self.source}: the messages of {channel.topic} are in {of}; {known}.")
 
 
@@ -173,8 +173,7 @@ class BagLog(_FileOfMessages):
             with reworded(f"{self.source}: {what}, is not in the bag, and is not one of ROS 2 itself"):
                 known = typesys.get_typestore(typesys.Stores.LATEST)
                 text, _ = known.generate_msgdef(connection.msgtype, ros_version=2)
-        make = ros1_decoder if self._version == 1 else ros2_decoder
-        return make, connection.msgtype, text.encode()
+        return partial(ros_decoder, aligned=self._version == 2), connection.msgtype, text.encode()
 
 
 def _decompressed(kind: str, data: bytes) -> bytes:
@@ -210,45 +209,15 @@ def json_decoder(name: str, definition: bytes) -> Decoder:
     return lambda data: json.loads(data, object_pairs_hook=distinct)
 
 
-def ros2_decoder(name: str, definition: bytes) -> Decoder:
-    """Return the decoder of ROS 2 messages."""
-    text = definition.decode("utf-8", "replace").encode()
-    schema = _library("mcap.records").Schema(id=1, name=name, encoding="ros2msg", data=text)
-    with redirect_stderr(io.StringIO()):  # the parser prints the text of the file
-        decoder: Decoder = _library("mcap_ros2.decoder").DecoderFactory().decoder_for("cdr", schema)
-    return decoder
-
-
-def protobuf_decoder(name: str, definition: bytes) -> Decoder:
-    """Return the decoder of messages in protobuf, as plain dictionaries."""
-    schema = _library("mcap.records").Schema(id=1, name=name, encoding="protobuf", data=definition)
-    decode = _library("mcap_protobuf.decoder").DecoderFactory().decoder_for("protobuf", schema)
-    return lambda data: _plain(decode(data))
-
-
-def _plain(value: Any) -> Any:
-    if hasattr(value, "DESCRIPTOR"):
-        fields = value.DESCRIPTOR.fields
-        known = [field.name for field in fields if not field.has_presence or value.HasField(field.name)]
-        return {name: _plain(getattr(value, name)) for name in known}
-    match value:
-        case {}:
-            return {str(key): _plain(item) for key, item in value.items()}
-        case int() | float() | str() | bytes():
-            return value
-    return [_plain(item) for item in value]
-
-
 # The format of each type of numbers.
 _NUMBERS = {
-    **{"bool": "?", "byte": "i1", "char": "u1", "octet": "u1", "int8": "i1", "uint8": "u1", "int16": "<i2"},
-    **{"uint16": "<u2", "int32": "<i4", "uint32": "<u4", "int64": "<i8", "uint64": "<u8"},
-    **{"float32": "<f4", "float64": "<f8"},
+    **{"bool": "?", "byte": "i1", "char": "u1", "octet": "u1", "int8": "i1", "uint8": "u1", "int16": "i2"},
+    **{"uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8"},
 }
 
 
-def ros1_decoder(name: str, definition: bytes) -> Decoder:
-    """Return the decoder of ROS 1 messages."""
+def ros_decoder(name: str, definition: bytes, *, aligned: bool) -> Decoder:
+    """Return the decoder of messages of ROS 1, or of ROS 2 in CDR, which are ``aligned``."""
     parse = _library("rosbags.typesys").get_types_from_msg
     parsed = parse(definition.decode("utf-8", "replace"), name)
     # The types that ROS 1 calls time and duration, by the names that rosbags gives them.
@@ -256,17 +225,20 @@ def ros1_decoder(name: str, definition: bytes) -> Decoder:
         parsed = {**parse(f"{kind} sec\n{kind} nanosec", f"builtin_interfaces/msg/{of}"), **parsed}
     fields = {of: [(field, kind[0].name, kind[1]) for field, kind in kinds] for of, (_, kinds) in parsed.items()}
     root = name if name in fields else name.replace("/", "/msg/", 1)
+    first = 4 if aligned else 0
 
     def decode(data: bytes) -> Any:
-        place = 0
+        place, order = first, ">" if aligned and data[1:2] == b"\0" else "<"
 
         def numbers(kind: str, count: int) -> Array:
             nonlocal place
-            start, format_ = place, np.dtype(_NUMBERS[kind])
-            place += count * format_.itemsize
+            format_ = np.dtype(order + _NUMBERS[kind])
+            if aligned and count:
+                place += (first - place) % format_.itemsize
+            start, place = place, place + count * format_.itemsize
             if place > len(data):
                 raise ValueError("the message is shorter than its definition")
-            return np.frombuffer(data[start:place], dtype=format_)
+            return np.frombuffer(data[start:place], dtype=format_).astype(_NUMBERS[kind], copy=False)
 
         def length() -> int:
             return int(numbers("uint32", 1)[0])
@@ -278,7 +250,8 @@ def ros1_decoder(name: str, definition: bytes) -> Decoder:
                 case "NAME":
                     return {field: value(of, kind, depth + 1) for field, of, kind in fields[inner]}
                 case "BASE" if inner[0] == "string":
-                    return numbers("uint8", length()).tobytes().decode("utf-8", "replace")
+                    text = numbers("uint8", length()).tobytes()
+                    return text.removesuffix(b"\0" if aligned else b"").decode("utf-8", "replace")
                 case "BASE":
                     return numbers(inner[0], 1).item()
             (of, element), count = inner[0], inner[1] if form == "ARRAY" else length()
@@ -291,8 +264,3 @@ def ros1_decoder(name: str, definition: bytes) -> Decoder:
         return value("NAME", root, 0)
 
     return decode
-
-
-_DECODERS: dict[tuple[str, str | None], Callable[[str, bytes], Decoder]]
-_DECODERS = {("cdr", "ros2msg"): ros2_decoder, ("ros1", "ros1msg"): ros1_decoder}
-_DECODERS["protobuf", "protobuf"] = protobuf_decoder

@@ -15,9 +15,30 @@ from ctxval._util.arrays import Array
 from ctxval._util.boxes import Box, climb, moves_to_bounds, separated_rows
 
 Values = Callable[[Array], Array]  # points (m, d) -> values (m,)
-_SHARES = np.array([0.03, 0.1, 0.3, 0.6, 1.0])  # steps of a line search, as shares of the way to a corner
-_LENGTHS = np.array([0.1, 0.4])  # steps along the slopes, as shares of the box in the steepest coordinate
-_COORDINATES = (0.0, 0.25, 0.5)  # shares of the coordinates that are moved to the corner alone, at least one each
+
+
+@dataclass(frozen=True)
+class AscentSettings:
+    """Sizes of a local search; shares of a line search are those of the way to a corner."""
+
+    few: int = 3  # largest dimension in which samples ever closer to the best points replace the climbs
+    pool: int = 128  # points in few dimensions that are the same in each search, for each dimension
+    zoomed: int = 6  # points that are sampled around
+    samples: int = 18  # samples in each of 1, 3 and 5 rounds in 1, 2 and 3 dimensions, for each dimension
+    moved: int = 3  # best points of which single coordinates are moved to bounds in each round
+    starts: int = 10  # points from which the function, or its approximation, is climbed
+    rounds: int = 3  # line searches of each climb
+    refined: int = 16  # points at which the function itself is evaluated after its approximation
+    finalists: int = 3  # points from which the function itself is climbed after its approximation
+    final_rounds: int = 2  # line searches of these climbs
+    shares: tuple[float, ...] = (0.03, 0.1, 0.3, 0.6, 1.0)  # steps of a line search
+    lengths: tuple[float, ...] = (0.1, 0.4)  # steps along the slopes, as shares of the box in the steepest coordinate
+    # shares of the coordinates that are moved to the corner alone, at least one each
+    coordinates: tuple[float, ...] = (0.0, 0.25, 0.5)
+
+    def line_cost(self, dimension: int) -> int:
+        """Return the number of evaluations of one line search from one point."""
+        return dimension + 1 + len(self.shares) + len(self.lengths) + len(self.coordinates)
 
 
 class Evaluations:
@@ -81,21 +102,22 @@ class Evaluations:
         calls = max(2, budget // (len(starts) * (self.dimension + 1)))
         climb(lambda Z: self._slopes(np.clip(Z, *box)), starts, *box, scale=scale, iterations=calls, evaluations=calls)
 
-    def search_lines(self, starts: Array, rounds: int) -> None:
+    def search_lines(self, starts: Array, rounds: int, settings: AscentSettings) -> None:
         """Search along lines from all starts ``(s, d)`` at once, several times.
 
         Each line leads along the slopes, or to the corner to which they point (Frank and Wolfe 1956), where convex
         functions have their maxima. Some steps move only the coordinates that promise most.
         """
         points, row = starts, np.arange(len(starts))
-        counts = np.maximum(1, (np.array(_COORDINATES) * self.dimension).astype(int))
+        counts = np.maximum(1, (np.array(settings.coordinates) * self.dimension).astype(int))
+        shares, lengths = (np.array(steps)[:, None] for steps in (settings.shares, settings.lengths))
         for _ in range(rounds):
             here, slopes = self._slopes(points)
             ways = np.where(slopes > 0, self.high, self.low) - points
             rank = np.argsort(np.argsort(-np.abs(slopes * ways), axis=1, kind="stable"), axis=1)
             few = np.where(rank[:, None] < counts[:, None], ways[:, None], 0.0)
             steepest = slopes / np.maximum(np.abs(slopes).max(axis=1, keepdims=True), 1e-300) * (self.high - self.low)
-            moves = [_SHARES[:, None] * ways[:, None], _LENGTHS[:, None] * steepest[:, None], few]
+            moves = [shares * ways[:, None], lengths * steepest[:, None], few]
             moved = np.clip(points[:, None] + np.concatenate(moves, axis=1), self.low, self.high)  # (s, q, d)
             values = self.evaluate(moved.reshape(-1, self.dimension)).reshape(moved.shape[:2])
             best = values.argmax(axis=1)
@@ -128,26 +150,14 @@ class Evaluations:
         return bool(self.evaluate(moved).max() > values[0] + gain)
 
 
-def line_search_cost(dimension: int) -> int:
-    """Return the number of evaluations of one line search from one point."""
-    return dimension + 1 + len(_SHARES) + len(_LENGTHS) + len(_COORDINATES)
-
-
-_STARTS = 10  # number of points from which the function, or its approximation, is climbed
-_ROUNDS = 3  # number of line searches of each climb
-_FINALISTS = (3, 2)
-"""Number of points from which the function itself is climbed after its approximation, and of line searches."""
-_FEW = 3  # largest dimension in which samples ever closer to the best points replace the climbs
-_POOL = 128  # number of points in few dimensions that are the same in each search, for each dimension
-_ZOOMED = 6  # number of points that are sampled around
-_SAMPLES = 18
-"""Number of samples in each round, for each dimension; there are 1, 3 and 5 rounds in 1, 2 and 3 dimensions."""
-_MOVED = 3  # number of best points of which single coordinates are moved to bounds in each round
-_REFINED = 16  # number of points at which the function itself is evaluated after its approximation
-
-
 def ascend(
-    function: Values, box: Box, budget: int, starts: Array, rng: np.random.Generator, rough: Values | None = None
+    function: Values,
+    box: Box,
+    budget: int,
+    starts: Array,
+    rng: np.random.Generator,
+    rough: Values | None = None,
+    settings: AscentSettings = AscentSettings(),
 ) -> tuple[Array, Array]:
     """Search a box within the unit cube for the maximum; return all points ``(m, d)`` and values, the largest first.
 
@@ -161,19 +171,20 @@ def ascend(
     ``(s, d)`` are evaluated first.
     """
     exact, inside = Evaluations(function, *box, budget, strict=False), np.clip(starts, *box)
-    if exact.dimension <= _FEW:
-        _search_few(exact, inside, rng)
+    if exact.dimension <= settings.few:
+        _search_few(exact, inside, rng, settings)
     else:
-        _search_many(exact, exact if rough is None else Evaluations(rough, *box, budget, strict=False), inside, rng)
+        approximation = exact if rough is None else Evaluations(rough, *box, budget, strict=False)
+        _search_many(exact, approximation, inside, rng, settings)
     return exact.best_first()
 
 
-def _search_few(exact: Evaluations, starts: Array, rng: np.random.Generator) -> None:
+def _search_few(exact: Evaluations, starts: Array, rng: np.random.Generator, settings: AscentSettings) -> None:
     """Sample ever closer to the best points: cheaper than slopes in few dimensions, and insensitive to kinks."""
     d, low, high = exact.dimension, exact.low, exact.high
     # A pool that fills the unit cube evenly and reaches its faces: a Kronecker sequence of generalised golden ratios
     # (Roberts 2018, "The unreasonable effectiveness of quasirandom sequences").
-    size, ratio = min(_POOL * d, exact.budget // 3), 2.0
+    size, ratio = min(settings.pool * d, exact.budget // 3), 2.0
     for _ in range(30):
         ratio = (1 + ratio) ** (1 / (d + 1))
     pool = (0.5 + np.arange(1, size + 1)[:, None] * ratio ** -np.arange(1.0, d + 1)) % 1
@@ -181,34 +192,36 @@ def _search_few(exact: Evaluations, starts: Array, rng: np.random.Generator) -> 
     pool = np.clip((1 + 2 * margin) * pool - margin, 0, 1)
     exact.evaluate(starts)
     exact.evaluate_inside(pool)
-    best, gap = _best(exact, _ZOOMED), size ** (-1 / d)
+    best, gap = _best(exact, settings.zoomed), size ** (-1 / d)
     for _ in range(2 * d - 1):
-        corners = moves_to_bounds(best[:_MOVED], low, high).reshape(-1, d)
-        count = min(_SAMPLES * d, exact.left - len(best) - len(corners))
+        corners = moves_to_bounds(best[: settings.moved], low, high).reshape(-1, d)
+        count = min(settings.samples * d, exact.left - len(best) - len(corners))
         if not len(best) or count < 1:
             return
         steps = np.resize((1.0, 0.3, 0.1), count)[:, None] * np.minimum(gap, 0.3 * (high - low))
         near = np.resize(best, (count, d)) + steps * rng.normal(size=(count, d))
         exact.evaluate(np.concatenate([best, np.clip(near, low, high), corners]))
-        best, gap = _best(exact, _ZOOMED), 0.5 * gap
+        best, gap = _best(exact, settings.zoomed), 0.5 * gap
 
 
-def _search_many(exact: Evaluations, rough: Evaluations, starts: Array, rng: np.random.Generator) -> None:
+def _search_many(
+    exact: Evaluations, rough: Evaluations, starts: Array, rng: np.random.Generator, settings: AscentSettings
+) -> None:
     """Climb from the best samples, on the approximation first; both share the budget."""
 
     def left() -> int:
         return exact.left - (0 if rough is exact else rough.budget - rough.left)
 
     def climb(on: Evaluations, starts: int, rounds: int) -> None:
-        allowed = left() // (rounds * line_search_cost(on.dimension))
+        allowed = left() // (rounds * settings.line_cost(on.dimension))
         if allowed:
-            on.search_lines(_best(on, min(starts, allowed)), rounds)
+            on.search_lines(_best(on, min(starts, allowed)), rounds, settings)
 
     rough.evaluate(np.concatenate([starts, rough.samples(max(8, rough.budget // 6), rng)]))
-    climb(rough, _STARTS, _ROUNDS)
+    climb(rough, settings.starts, settings.rounds)
     if rough is not exact:
-        exact.evaluate(np.concatenate([starts, _best(rough, _REFINED, 0.02)]))
-    climb(exact, *_FINALISTS)
+        exact.evaluate(np.concatenate([starts, _best(rough, settings.refined, 0.02)]))
+    climb(exact, settings.finalists, settings.final_rounds)
     for _ in range(4):
         if left() < 1 or not exact.move_to_bounds(rng):
             return
@@ -223,18 +236,19 @@ class Effort:
     batches: int  # number of calls in which all of these are evaluated
 
 
-def usual_effort(dimension: int, budget: int) -> Effort:
+def usual_effort(dimension: int, budget: int, settings: AscentSettings = AscentSettings()) -> Effort:
     """Return what a search with this budget usually evaluates, if the function has an approximation."""
-    if dimension <= _FEW:
-        first, each = _STARTS + min(_POOL * dimension, budget // 3), _ZOOMED + (_SAMPLES + 2 * _MOVED) * dimension
+    if dimension <= settings.few:
+        first = settings.starts + min(settings.pool * dimension, budget // 3)
+        each = settings.zoomed + (settings.samples + 2 * settings.moved) * dimension
         exact = min(budget, first + (2 * dimension - 1) * each)
         return Effort(exact, 0, 2 + -(-(exact - first) // each))
-    line, rounds = line_search_cost(dimension), _ROUNDS - 1  # most climbs end before their last round
-    rough = min(budget, _STARTS + max(8, budget // 6))
-    climbs = min(_STARTS, (budget - rough) // (_ROUNDS * line))
+    line, rounds = settings.line_cost(dimension), settings.rounds - 1  # most climbs end before their last round
+    rough = min(budget, settings.starts + max(8, budget // 6))
+    climbs = min(settings.starts, (budget - rough) // (settings.rounds * line))
     rough += rounds * line * climbs
-    exact = min(budget - rough, _STARTS + _REFINED)
-    finals = min(_FINALISTS[0], (budget - rough - exact) // (_FINALISTS[1] * line))
+    exact = min(budget - rough, settings.starts + settings.refined)
+    finals = min(settings.finalists, (budget - rough - exact) // (settings.final_rounds * line))
     exact += line * finals
     exact += min(budget - rough - exact, 4 * dimension)
     return Effort(exact, rough, 3 + (2 * rounds if climbs else 0) + (3 if finals else 0))

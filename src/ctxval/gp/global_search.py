@@ -18,9 +18,18 @@ from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import separated_rows
 from ctxval.gp.ascent import Evaluations, Values
 
-_SAMPLED, _EVOLVED, _CLIMBED = 0.35, 0.7, 0.88  # shares of the evaluations after which these parts end
-_REACHES = (0.3, 0.1)  # least distance of good parents at first and at last, and of local maxima, in diagonals
-_STEPS = (0.3, 0.005)  # largest standard deviation of a mutation in the first and in the last generation
+
+@dataclass(frozen=True)
+class GlobalSearchSettings:
+    """The parts of a global search, which end after shares of its evaluations, and how far apart niches are."""
+
+    sampled: float = 0.35
+    evolved: float = 0.7
+    climbed: float = 0.88
+    # least distance of good parents at first and at last, and of local maxima, in diagonals
+    reaches: tuple[float, float] = (0.3, 0.1)
+    # largest standard deviation of a mutation in the first and in the last generation
+    steps: tuple[float, float] = (0.3, 0.005)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +42,13 @@ class GlobalMaximum:
 
 
 def search_globally(
-    function: Values, dimension: int, starts: Array, rng: np.random.Generator, *, evaluations: int = 9000
+    function: Values,
+    dimension: int,
+    starts: Array,
+    rng: np.random.Generator,
+    *,
+    evaluations: int = 9000,
+    settings: GlobalSearchSettings = GlobalSearchSettings(),
 ) -> GlobalMaximum:
     """Search the unit cube for the maximum of a function, and return everything that was evaluated, of so many points.
 
@@ -41,10 +56,10 @@ def search_globally(
     """
     done = Evaluations(function, np.zeros(dimension), np.ones(dimension), evaluations)
     done.evaluate(np.clip(starts, 0, 1))
-    for count in _batches(int(_SAMPLED * evaluations) - (evaluations - done.left), evaluations, 3):
+    for count in _batches(int(settings.sampled * evaluations) - (evaluations - done.left), evaluations, 3):
         done.evaluate(done.samples(count, rng))
-    _evolve(done, rng)
-    budget = done.left - int((1 - _CLIMBED) * evaluations)
+    _evolve(done, rng, settings)
+    budget = done.left - int((1 - settings.climbed) * evaluations)
     climbs = min(12, budget // (8 * (dimension + 1)))  # each with 8 slopes at least
     if climbs > 0:
         done.climb(_apart(done.finite(), 0.2)[:climbs], budget)
@@ -58,8 +73,8 @@ def search_globally(
             best = done.best_first()[0][:100]
             near = best[np.argsort(np.linalg.norm(best - best[0], axis=1), kind="stable")[: 2 * dimension + 2]]
             step = 0.02 * (1e-5 / 0.02) ** (batch / max(1, len(sizes) - 1))
-            done.evaluate(_offspring(best[:4], near, step, min(size, done.left), rng))
-    return GlobalMaximum(*done.best_first(), _apart(done.finite(), _REACHES[-1]))
+            done.evaluate(_offspring(best[:4], near, step, min(size, done.left), rng, settings))
+    return GlobalMaximum(*done.best_first(), _apart(done.finite(), settings.reaches[-1]))
 
 
 def _batches(count: int, evaluations: int, most: int) -> list[int]:
@@ -79,9 +94,9 @@ def _apart(points: Array, reach: float) -> Array:
 # Evolution
 
 
-def _evolve(done: Evaluations, rng: np.random.Generator) -> None:
+def _evolve(done: Evaluations, rng: np.random.Generator, settings: GlobalSearchSettings) -> None:
     """Evaluate generations of offspring of good points and of prominent points, each set apart from each other."""
-    count = done.left - int((1 - _EVOLVED) * done.budget)
+    count = done.left - int((1 - settings.evolved) * done.budget)
     sizes = _batches(count, done.budget, int(np.clip(np.sqrt(done.budget) / 4, 3, 40)))
     # Of smooth functions, prominences are small once the samples are dense; the way to a cliff stays prominent.
     prominent, seen = np.empty(0, dtype=np.intp), 0
@@ -91,12 +106,12 @@ def _evolve(done: Evaluations, rng: np.random.Generator) -> None:
         if not len(finite):
             done.evaluate(done.samples(size, rng))
             continue
-        reach, step = (first * (last / first) ** share for first, last in (_REACHES, _STEPS))
+        reach, step = (first * (last / first) ** share for first, last in (settings.reaches, settings.steps))
         everywhere, heights = done.in_order()
         rows, seen = np.concatenate([prominent, np.arange(seen, len(everywhere))]), len(everywhere)
         prominent = rows[np.argsort(-_prominences(everywhere, heights, rows), kind="stable")[:200]]
-        first = _offspring(_apart(finite, reach), finite[:100], step, size - size // 2, rng)
-        second = _offspring(_apart(everywhere[prominent], 0.02), finite[:100], step, size // 2, rng)
+        first = _offspring(_apart(finite, reach), finite[:100], step, size - size // 2, rng, settings)
+        second = _offspring(_apart(everywhere[prominent], 0.02), finite[:100], step, size // 2, rng, settings)
         done.evaluate(np.concatenate([first, second]))
 
 
@@ -118,7 +133,9 @@ def _prominences(points: Array, heights: Array, rows: Rows) -> Array:
     return np.asarray(values[rows] - fitted[:, 0, 0])
 
 
-def _offspring(parents: Array, pool: Array, step: float, count: int, rng: np.random.Generator) -> Array:
+def _offspring(
+    parents: Array, pool: Array, step: float, count: int, rng: np.random.Generator, settings: GlobalSearchSettings
+) -> Array:
     """Return ``count`` points: mutations in all or a few coordinates, differential moves, and moves to bounds."""
     # Half of the parents are drawn uniformly, so that each niche is followed; half prefer good ones.
     preferences = 1 / np.arange(1, len(parents) + 1)
@@ -128,7 +145,7 @@ def _offspring(parents: Array, pool: Array, step: float, count: int, rng: np.ran
     all_of, few_of, differential, bound = np.array_split(chosen, 4)
     children = [
         all_of + _normal(all_of.shape, step, rng),
-        few_of + _normal(few_of.shape, max(step, _STEPS[0] / 3), rng) * _few(few_of.shape, rng),
+        few_of + _normal(few_of.shape, max(step, settings.steps[0] / 3), rng) * _few(few_of.shape, rng),
     ]
     # Shares of differences between two points of the pool, in a random part of the coordinates.
     first, second = rng.integers(len(pool), size=(2, len(differential)))

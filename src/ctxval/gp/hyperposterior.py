@@ -207,9 +207,6 @@ def _slice(log_density: Callable[[Array], float], state: Array, direction: Array
 # rule; Wilson, Borovitskiy, Terenin, Mostowsky and Deisenroth 2020). The prior's path is approximated by random waves;
 # the correction is exact.
 
-# Frequencies of a prior path: the error of its covariance is about 1 / sqrt(2 WAVES), that of its maximum much smaller.
-WAVES = 512
-
 
 @dataclass(frozen=True, eq=False)
 class Paths:
@@ -266,13 +263,16 @@ def _waves(Z: Array, frequencies: Array) -> Array:
     return np.asarray(np.concatenate([np.cos(phases), np.sin(phases)], axis=1) / np.sqrt(len(frequencies)))
 
 
-def draw_paths(conditioned: Conditioned, X: Array, count: int, rng: np.random.Generator) -> Paths:
-    """Return paths on the process's scale given points ``(n, d)``, with mu and sigma drawn from their posterior."""
+def draw_paths(conditioned: Conditioned, X: Array, count: int, rng: np.random.Generator, waves: int = 512) -> Paths:
+    """Return paths on the process's scale given points ``(n, d)``, with mu and sigma drawn from their posterior.
+
+    The error of the covariance of a path is about ``1 / sqrt(2 waves)``, that of its maximum much smaller.
+    """
     hyperparameters, (n, d) = conditioned.hyperparameters, X.shape
     # The spectrum of a Matern kernel is a multivariate t with 2 nu degrees of freedom.
-    tails = np.sqrt(2 * hyperparameters.nu / rng.chisquare(2 * hyperparameters.nu, (WAVES, 1)))
-    frequencies = rng.normal(size=(WAVES, d)) * tails / np.exp(hyperparameters.log_scales)
-    amplitudes = rng.normal(size=(2 * WAVES, count))
+    tails = np.sqrt(2 * hyperparameters.nu / rng.chisquare(2 * hyperparameters.nu, (waves, 1)))
+    frequencies = rng.normal(size=(waves, d)) * tails / np.exp(hyperparameters.log_scales)
+    amplitudes = rng.normal(size=(2 * waves, count))
     scales = np.sqrt(conditioned.scale2 * (n - 1) / rng.chisquare(n - 1, count))
     means = rng.normal(conditioned.mean, scales * np.sqrt(conditioned.mean_variance))
     noise = np.exp(hyperparameters.log_noise)

@@ -157,10 +157,7 @@ def spread_rows(values: Array, count: int) -> Rows:
     return np.sort(np.concatenate([largest, evenly]))
 
 
-LONG = 1000  # length of a history from which on only a subset is kept
-
-
-def kept_rows(points: Array, values: Array, count: int, long: int = LONG) -> Rows:
+def kept_rows(points: Array, values: Array, count: int, long: int = 1000) -> Rows:
     """Return the rows that represent a history of points ``(n, d)`` and values ``(n,)``, in their order.
 
     Below ``long`` points these are all rows. From then on, a quarter of ``count`` rows have the largest values, a

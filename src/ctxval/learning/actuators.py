@@ -23,12 +23,21 @@ from ctxval.learning.residual_data import floors
 from ctxval.models.increments import standard_deviations
 from ctxval.systems.actuator import Actuator
 
-_LONGEST = 6.0  # steps, of a delay and of a time constant
-_DELAYS, _LAGS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0), (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
-_TRIED = [*((each, 0.0) for each in _DELAYS), *((0.0, each) for each in _LAGS), (1.0, 1.0), (1.0, 2.0), (2.0, 2.0)]
-_BETTER, _NEAR = 0.3, 0.1  # differences of the log evidence per recorded value; see `found_actuator`
-_LEARNED_FROM = 150  # transitions
-_CLIMBED = 4  # candidates whose hyperparameters are searched for
+
+@dataclass(frozen=True)
+class ActuatorSettings:
+    """Which delays and lags are tried, and how clearly one must explain the residual."""
+
+    better: float = 0.3  # by which the log evidence per recorded value must be larger than without an actuator
+    close: float = 0.1  # by which it may be smaller before the actuator is refined
+    longest: float = 6.0  # steps, of a delay and of a time constant
+    learned_from: int = 150  # transitions
+    climbed: int = 4  # candidates whose hyperparameters are searched for
+    tried: tuple[tuple[float, float], ...] = (  # delays and lags in steps
+        *((delay, 0.0) for delay in (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0)),
+        *((0.0, lag) for lag in (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)),
+        *((1.0, 1.0), (1.0, 2.0), (2.0, 2.0)),
+    )
 
 
 RecordsOf = Callable[[Actuator], Sequence[Record]]
@@ -36,11 +45,15 @@ RecordsOf = Callable[[Actuator], Sequence[Record]]
 
 
 def found_actuator(
-    model: Model, records_of: RecordsOf, before: Actuator | None = None, evaluations: int = 80
+    model: Model,
+    records_of: RecordsOf,
+    before: Actuator | None = None,
+    evaluations: int = 80,
+    settings: ActuatorSettings = ActuatorSettings(),
 ) -> Actuator | None:
     """Return the delay and the lag with which the residual of M is most probably a function; None if they do not help.
 
-    They help if the log evidence per recorded value, with the hyperparameters at their mode, is larger by 0.3 than
+    They help if the log evidence per recorded value, with the hyperparameters at their mode, is clearly larger than
     without them. One that was found ``before``, in fewer executions, is refined. So many ``evaluations`` of the records
     are allowed while the actuator is refined, twice. A LinAlgError is raised if states cannot be estimated.
     """
@@ -57,7 +70,7 @@ def found_actuator(
     def standardised(Z: Array) -> Array:
         return np.asarray((Z - Z.mean(axis=0)) / standard_deviations(Z))
 
-    rows = learning_rows(standardised(Z), inputs, _LEARNED_FROM)
+    rows = learning_rows(standardised(Z), inputs, settings.learned_from)
 
     def data(actuator: Actuator) -> tuple[Array, Array]:
         """Return states and acting inputs ``(N, n + m)``, and residuals over their sizes if inputs act at once."""
@@ -74,13 +87,13 @@ def found_actuator(
         shift, scale = Z.mean(axis=0), standard_deviations(Z)
 
         def unlikely(each: Array) -> float:
-            Z, E = data(Actuator(*np.clip(each, 0.0, _LONGEST).tolist()))
+            Z, E = data(Actuator(*np.clip(each, 0.0, settings.longest).tolist()))
             return -log_posterior(mode.kernel, mode.place, (Z - shift) / scale, E)[0]
 
         at = np.array([start.delay, start.lag])
         simplex = at + np.array([[0.0, 0.0], [0.25, 0.0], [0.0, 0.25]])
         options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-5, "fatol": 1e-3}
-        best = np.clip(minimize(unlikely, at, method="Nelder-Mead", options=options).x, 0.0, _LONGEST)
+        best = np.clip(minimize(unlikely, at, method="Nelder-Mead", options=options).x, 0.0, settings.longest)
         # Whole steps and no lag are preferred as by the Bayesian information criterion.
         whole, each = np.array([np.round(best[0]), best[1]]), 0.5 * np.log(len(rows))
         near = [(best, 2), (whole, 1), (best * [1, 0], 1), (whole * [1, 0], 0)]
@@ -88,19 +101,19 @@ def found_actuator(
         return Actuator(*chosen.tolist())
 
     base = mode_of(Actuator())
-    without, tried = base.height, [before] if before else [Actuator(*each) for each in _TRIED]
-    if len(tried) > _CLIMBED:  # those that explain most with the hyperparameters of inputs that act at once
+    without, tried = base.height, [before] if before else [Actuator(*each) for each in settings.tried]
+    if len(tried) > settings.climbed:  # those that explain most with the hyperparameters of inputs that act at once
         of_tried = [data(each) for each in tried]
         heights = [log_posterior(base.kernel, base.place, standardised(Z), E)[0] for Z, E in of_tried]
         tried = [tried[k] for k in sorted(range(len(tried)), key=lambda k: -heights[k])]
-    mode, best = max(((mode_of(each), each) for each in tried[:_CLIMBED]), key=lambda pair: pair[0].height)
+    mode, best = max(((mode_of(each), each) for each in tried[: settings.climbed]), key=lambda pair: pair[0].height)
     values = len(rows) * int(live.sum())
-    if mode.height < without - _NEAR * values:
+    if mode.height < without - settings.close * values:
         return None
     for _ in range(2):  # the noise that a wrong actuator seems to add is less the second time
         best = refined(best, mode)
         mode = mode_of(best)
-    return best if mode.height > without + _BETTER * values else None
+    return best if mode.height > without + settings.better * values else None
 
 
 @dataclass(frozen=True)

@@ -18,18 +18,18 @@ from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
-from ctxval.learning.actuators import found_actuator
+from ctxval.learning.actuators import ActuatorSettings, found_actuator
 from ctxval.learning.closed_loops import LoopPlanner, unseen_parameters
 from ctxval.learning.dry_friction import DryFriction, FrictionSettings, found_friction
 from ctxval.learning.dynamics_posterior import LearnedCovariances, PosteriorSettings, condition, learn_covariances
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
-from ctxval.learning.noise_study import STRUCTURES, WITHOUT_LAGS, NoiseStudy
-from ctxval.learning.precision import AgreeingDynamics, agreeing_posterior
+from ctxval.learning.noise_study import NoiseSettings, NoiseStudy
+from ctxval.learning.precision import AgreeingDynamics, AgreementSettings, agreeing_posterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, schedule, scheduled
-from ctxval.learning.regular import split_transitions
+from ctxval.learning.regular import RegularSettings, split_transitions
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
@@ -50,6 +50,10 @@ class LearningSettings:
     noise_share: float = 0.75  # largest share of the squares of these errors that counts as noise
     slow_loop: float = 0.02  # seconds of a closed loop on M from which on loops are distributed over the cores
     friction: FrictionSettings = field(default_factory=FrictionSettings)
+    actuators: ActuatorSettings = field(default_factory=ActuatorSettings)
+    regular: RegularSettings = field(default_factory=RegularSettings)
+    noise: NoiseSettings = field(default_factory=NoiseSettings)
+    agreement: AgreementSettings = field(default_factory=AgreementSettings)
 
 
 class DynamicsStudy(ShortRepr):
@@ -74,9 +78,9 @@ class DynamicsStudy(ShortRepr):
         quantile: float = QUANTILE,
         extended: ExtendedValidation | None = None,
         friction: DryFriction | None = None,
-        settings: LearningSettings = LearningSettings(),
+        settings: LearningSettings | None = None,
     ) -> None:
-        self.settings = settings
+        self.settings = settings or LearningSettings()
         self.given, self.seed, self.quantile, self.friction = validation, seed, quantile, friction
         self.extended = ExtendedValidation(validation) if extended is None else extended
         self.actuator, self.validation = self.extended.actuator, self.extended.validation
@@ -185,7 +189,7 @@ class DynamicsStudy(ShortRepr):
             if recorded is None or self.extended.loops is None or not extended:
                 return None
             settings, seed = PosteriorSettings.for_horizon(self.extended.loops.horizon), (self.seed, len(executed), 0)
-            split = split_transitions(model, *recorded, seed, settings)
+            split = split_transitions(model, *recorded, seed, settings, self.settings.regular)
             if split is not None and (parts := split.posterior()) is not None:
                 points, loops = np.array([point for point, _ in extended]), [loop for _, loop in extended]
                 return LearnedDynamics(self, parts[0], points, loops, with_data, split, parts[1])
@@ -262,9 +266,10 @@ class DynamicsStudy(ShortRepr):
     @functools.cached_property
     def noise(self) -> NoiseStudy:
         """Learns dynamics with noise."""
-        # What friction does within a step would seem to be a history.
-        structures = STRUCTURES if self.friction is None else WITHOUT_LAGS
-        return NoiseStudy(self.extended, self.planner, self.search, self.seed, self.quantile, structures)
+        settings = self.settings.noise
+        if self.friction is not None:  # what it does within a step would seem to be a history
+            settings = replace(settings, structures=tuple(each for each in settings.structures if not each.lags))
+        return NoiseStudy(self.extended, self.planner, self.search, self.seed, self.quantile, settings)
 
     def without(self, learned: LearnedDynamics, k: int) -> LearnedDynamics | None:
         """Return what all executions but one teach, with the same hyperparameters and structure of noise."""
@@ -345,7 +350,7 @@ class DynamicsStudy(ShortRepr):
         plain = [] if estimated else estimated_with(Actuator())
         model, records_of = before_refinement(self.validation.model), estimated_with if estimated else with_inputs
         with single_threaded(), np.errstate(all="ignore"):
-            return found_actuator(model, records_of, before, 30 if estimated else 80)
+            return found_actuator(model, records_of, before, 30 if estimated else 80, self.settings.actuators)
 
     def _with_friction(self, executed: Executed, learned: LearnedDynamics) -> LearnedDynamics | None:
         """Return what executions teach beside the dry friction that scheduled ones show; None if they show none.

@@ -24,12 +24,32 @@ from ctxval.gp.regression import most_likely
 
 FAMILIES = ((2.5, 0.0), (2.5, 1.0), (1.5, 0.0))  # smoothness and growth of the covariances, equally likely a priori
 SMOOTHER_FAMILIES = ((4.5, 0.0), *FAMILIES)  # those of the system itself, without a learned model, which may be rough
-NOISE = (1e-7, 1.0)  # bounds of the noise variance, relative to that of the Matern part
-# Medians of the length-scales, in standard deviations of the data, and of the variances of the constant and of the
-# linear part, relative to that of the Matern part, with the deviations of their logarithms.
-_LENGTH, _LINEAR_PART = (3.0, 1.0), (1.0, 5.0)
-_FREEDOM = 6.0  # degrees of freedom of the t distribution of the proposals
-_LINEAR = (1e-4, 1e6)  # bounds of the variances of the constant and of the linear part
+
+
+@dataclass(frozen=True)
+class HyperparameterPrior:
+    """Medians of the hyperparameters with the deviations of their logarithms, and their bounds.
+
+    Length-scales are in standard deviations of the data, and variances relative to that of the Matern part.
+    """
+
+    length: tuple[float, float] = (3.0, 1.0)
+    linear: tuple[float, float] = (1.0, 5.0)  # the variances of the constant and of the linear part
+    noise: tuple[float, float] = (1e-6, 4.0)
+    length_bounds: tuple[float, float] = (0.05, 100.0)  # no column is irrelevant beyond 100 standard deviations
+    linear_bounds: tuple[float, float] = (1e-4, 1e6)
+    noise_bounds: tuple[float, float] = (1e-7, 1.0)
+
+    def moments(self, count: int) -> tuple[Array, Array]:
+        """Return means and standard deviations of the ``count`` parameters (theta, log noise)."""
+        medians, deviations = np.transpose([*[self.length] * (count - 3), self.linear, self.linear, self.noise])
+        return np.log(medians), deviations
+
+    def log_density(self, parameters: Array) -> tuple[float, Array]:
+        """Return the log density of (theta, log noise) up to a constant, and its gradient."""
+        centres, deviations = self.moments(len(parameters))
+        scaled = (parameters - centres) / deviations
+        return float(-0.5 * (scaled**2).sum()), -scaled / deviations
 
 
 @dataclass(frozen=True)
@@ -44,10 +64,12 @@ class ResidualKernel(Covariance):
     nu: float  # smoothness of the Matern part, 1.5, 2.5 or 4.5
     growth: float  # factor of the product of the inputs; 0 for a stationary Matern part
     inputs: int  # the number m of inputs of the system, which are the last columns
+    prior: HyperparameterPrior = HyperparameterPrior()
 
     def box(self, dimension: int) -> tuple[Array, Array]:
-        """Return the bounds of (theta, log noise); no column is irrelevant beyond 100 standard deviations."""
-        low, high = np.log([*[(0.05, 100.0)] * dimension, *[_LINEAR] * 2, NOISE]).T
+        """Return the bounds of (theta, log noise)."""
+        prior = self.prior
+        low, high = np.log([*[prior.length_bounds] * dimension, *[prior.linear_bounds] * 2, prior.noise_bounds]).T
         return low, high
 
     def within(self, parameters: Array) -> tuple[Array, float]:
@@ -175,22 +197,24 @@ class HyperparameterPosterior:
         for family in self.families:
             kernel, Z, Y, D = family[0].kernel, family[0].Z, family[0].Y, len(family[0].place)
             proposals, heights, densities = [], [], []
-            for mode in family:  # draws of t distributions around the modes
+            freedom = 6.0  # degrees of freedom of the t distributions of the proposals
+            for mode in family:  # draws around the modes
                 normal = rng.standard_normal((48 // len(family), D))
-                deviations = normal / np.sqrt(rng.chisquare(_FREEDOM, (len(normal), 1)) / _FREEDOM)
+                deviations = normal / np.sqrt(rng.chisquare(freedom, (len(normal), 1)) / freedom)
                 proposals.append(mode.place + deviations @ mode.scale.T)
             drawn = np.concatenate(proposals)
             # All modes of a family make one proposal distribution: the mixture of theirs in equal parts.
-            constant = gammaln((_FREEDOM + D) / 2) - gammaln(_FREEDOM / 2) - 0.5 * D * np.log(_FREEDOM * np.pi)
+            constant = gammaln((freedom + D) / 2) - gammaln(freedom / 2) - 0.5 * D * np.log(freedom * np.pi)
             for mode in family:
                 squares = (np.linalg.solve(mode.scale, (drawn - mode.place).T) ** 2).sum(axis=0)
                 log_volume = np.linalg.slogdet(mode.scale)[1]
-                densities.append(constant - log_volume - 0.5 * (_FREEDOM + D) * np.log1p(squares / _FREEDOM))
+                densities.append(constant - log_volume - 0.5 * (freedom + D) * np.log1p(squares / freedom))
             density = logsumexp(densities, axis=0) - np.log(len(family))
             for place in drawn:
                 theta, noise = kernel.within(place)
                 try:
-                    heights.append(_log_likelihood(kernel(theta, Z, Z), noise, Y)[0] + _log_prior(place)[0])
+                    likelihood = _log_likelihood(kernel(theta, Z, Z), noise, Y)[0]
+                    heights.append(likelihood + kernel.prior.log_density(place)[0])
                 except InputError:  # the covariance is not positive definite
                     heights.append(-np.inf)
             places += [(kernel, place) for place in drawn]
@@ -204,15 +228,16 @@ class HyperparameterPosterior:
 def draw_prior(dimension: int, inputs: int, rng: np.random.Generator) -> ResidualHyperparameters:
     """Return hyperparameters from the prior, such as those of a system on which a posterior is tested."""
     nu, growth = FAMILIES[rng.integers(len(FAMILIES))]
-    kernel, (centres, deviations) = ResidualKernel(nu, growth, inputs), _prior(dimension + 3)
+    kernel = ResidualKernel(nu, growth, inputs)
+    centres, deviations = kernel.prior.moments(dimension + 3)
     return ResidualHyperparameters(kernel, *kernel.within(centres + deviations * rng.standard_normal(dimension + 3)))
 
 
 def learning_rows(Z: Array, inputs: int, count: int) -> Rows:
     """Return rows of well-spread pairs, from which the hyperparameters are learned."""
-    k = Z.shape[1]
-    theta = np.log([*[_LENGTH[0]] * k, 1.0, 1.0])
-    return pivoted_rows(ResidualKernel(2.5, 0.0, inputs), theta, Z, count, least=1e-8)
+    kernel = ResidualKernel(2.5, 0.0, inputs)
+    theta = np.log([*[kernel.prior.length[0]] * Z.shape[1], 1.0, 1.0])
+    return pivoted_rows(kernel, theta, Z, count, least=1e-8)
 
 
 def log_posterior(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array) -> tuple[float, Array]:
@@ -227,7 +252,7 @@ def log_posterior(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array)
     W = scaled @ scaled.T
     W -= Y.shape[1] * factor.inverse()
     W *= 0.5
-    prior, slope = _log_prior(parameters)
+    prior, slope = kernel.prior.log_density(parameters)
     return value + prior, np.append(gradient(W), noise * np.trace(W)) + slope
 
 
@@ -241,24 +266,13 @@ def _log_likelihood(K: Array, noise: float, Y: Array) -> tuple[float, CholeskyFa
     return float(value), factor, weights / np.sqrt(squares)
 
 
-def _log_prior(parameters: Array) -> tuple[float, Array]:
-    centres, deviations = _prior(len(parameters))
-    scaled = (parameters - centres) / deviations
-    return float(-0.5 * (scaled**2).sum()), -scaled / deviations
-
-
-def _prior(count: int) -> tuple[Array, Array]:
-    """Return means and standard deviations of the ``count`` parameters (theta, log noise)."""
-    medians, deviations = np.transpose([*[_LENGTH] * (count - 3), _LINEAR_PART, _LINEAR_PART, (1e-6, 4.0)])
-    return np.log(medians), deviations
-
-
 def climbed(kernel: ResidualKernel, Z: Array, Y: Array) -> list[tuple[float, Array]]:
     """Return the log posterior and its place where climbs from little and from much noise end, the highest first."""
     density = functools.partial(log_posterior, kernel, Z=Z, Y=Y)
     bounds = list(zip(*kernel.box(Z.shape[1]), strict=True))
     # The data can look like a rough function, or like a smooth one with noise.
-    starts = [np.log([*[_LENGTH[0]] * Z.shape[1], 1.0, 1.0, noise]) for noise in (1e-5, 0.1)]
+    length = kernel.prior.length[0]
+    starts = [np.log([*[length] * Z.shape[1], 1.0, 1.0, noise]) for noise in (1e-5, 0.1)]
     modes = [most_likely(density, start[None], bounds, tolerance=1e-7) for start in starts]
     return sorted(((density(mode)[0], mode) for mode in modes), key=lambda mode: -mode[0])
 

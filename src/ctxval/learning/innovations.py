@@ -24,12 +24,20 @@ from ctxval.learning.histories import History, Memory, Record, jacobian, of_one_
 from ctxval.learning.local_noise import LocalNoise, local_noise
 from ctxval.learning.run_effects import RunEffects, run_effects
 
-CENTRES = 64
-_CANDIDATES = 600  # regressors from which centres are chosen
-_LENGTH = np.log(3.0)  # median of the length-scales in standard deviations of the data; their logarithms deviate by 1
-_AMPLITUDES = np.logspace(-4, 2, 19)  # of the residual, in root mean squares
-_NOISES = np.logspace(-3.3, 0.3, 18)  # standard deviations of the noise, in root mean squares of the residual
 DrawnWeights = tuple[Features, Array, Array]  # weights (k, F, n) and standard deviations of noise (k, n) of k draws
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """The features of the residual, and what their hyperparameters are a priori."""
+
+    centres: int = 64  # well-spread regressors at which features are
+    candidates: int = 600  # regressors from which centres are chosen
+    length: float = 3.0  # median of the length-scales in standard deviations of the data; their logarithms deviate by 1
+    # first and last power of 10, and number, of amplitudes of the residual in root mean squares
+    amplitudes: tuple[float, float, int] = (-4.0, 2.0, 19)
+    # the same, of standard deviations of the noise in root mean squares of the residual
+    noises: tuple[float, float, int] = (-3.3, 0.3, 18)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +52,7 @@ class Scaled:
     scale: Array
     inputs: int  # the number m of inputs
     products: bool = True  # whether inputs times states are among the features
+    settings: FeatureSettings = FeatureSettings()
 
     @classmethod
     def of(cls, Z: Array, E: Array, pairs: Array, inputs: int, products: bool = True) -> Scaled:
@@ -66,8 +75,8 @@ class Scaled:
     def centres(self) -> Array:
         """Well-spread regressors, shape ``(M, D)``."""
         together = np.concatenate([self.Z, np.clip(self.visited, -5.0, 5.0)])
-        some = np.random.default_rng(len(together)).permutation(len(together))[:_CANDIDATES]
-        return np.asarray(together[some][spread_rows(together[some], CENTRES)])
+        some = np.random.default_rng(len(together)).permutation(len(together))[: self.settings.candidates]
+        return np.asarray(together[some][spread_rows(together[some], self.settings.centres)])
 
     def features(self, theta: Array, centres: Array | None = None) -> Features:
         """Return the features for hyperparameters: logarithms of the scales of (x, u), of all lags, and of linear."""
@@ -187,6 +196,7 @@ class _Spectrum:
     squares: Array
     count: int
     sizes: Array
+    settings: FeatureSettings
 
     @classmethod
     def of(cls, phi: Array, scaled: Scaled, live: Mask, rows: Array) -> _Spectrum:
@@ -195,7 +205,7 @@ class _Spectrum:
         Phi, Y = phi * rows, scaled.E[:, live] / sizes * rows
         values, vectors = np.linalg.eigh(Phi.T @ Phi)
         values = np.maximum(values, 1e-12)
-        return cls(values, vectors, vectors.T @ (Phi.T @ Y), (Y**2).sum(axis=0), len(Y), sizes)
+        return cls(values, vectors, vectors.T @ (Phi.T @ Y), (Y**2).sum(axis=0), len(Y), sizes, scaled.settings)
 
     def log_evidence(self, i: int, amplitudes: Array, noises: Array) -> Array:
         """Return the log density of one state's errors for all amplitudes and noises, shape ``(A, S)``."""
@@ -207,19 +217,25 @@ class _Spectrum:
 
     def log_posterior(self, theta: Array) -> float:
         """Return the log posterior of hyperparameters, with amplitudes and noises integrated out on a grid."""
-        heights = [self.log_evidence(i, _AMPLITUDES, _NOISES).ravel() for i in range(len(self.squares))]
-        prior = -0.5 * (((theta[:-1] - _LENGTH) ** 2).sum() + ((theta[-1] - _LENGTH) / 3) ** 2)
+        heights = [self.log_evidence(i, *self._grid).ravel() for i in range(len(self.squares))]
+        length = np.log(self.settings.length)
+        prior = -0.5 * (((theta[:-1] - length) ** 2).sum() + ((theta[-1] - length) / 3) ** 2)
         return float(sum(logsumexp(each) - np.log(each.size) for each in heights) + prior)
+
+    @functools.cached_property
+    def _grid(self) -> tuple[Array, Array]:
+        """Amplitudes and noises."""
+        return np.logspace(*self.settings.amplitudes), np.logspace(*self.settings.noises)
 
     @functools.cached_property
     def _grids(self) -> list[tuple[Array, Array, Array]]:
         """The log densities of amplitudes and noises on a grid around the mode, for each state."""
         width, grids = min(0.3, 3 / np.sqrt(self.count)), []
         for i in range(len(self.sizes)):
-            coarse = self.log_evidence(i, _AMPLITUDES, _NOISES)
+            coarse = self.log_evidence(i, *self._grid)
             j, k = np.unravel_index(int(coarse.argmax()), coarse.shape)
-            amplitudes = _AMPLITUDES[j] * np.logspace(-0.7, 0.7, 11)
-            noises = _NOISES[k] * np.exp(np.linspace(-0.24 - width, 0.24 + width, 25))
+            amplitudes = self._grid[0][j] * np.logspace(-0.7, 0.7, 11)
+            noises = self._grid[1][k] * np.exp(np.linspace(-0.24 - width, 0.24 + width, 25))
             grids.append((self.log_evidence(i, amplitudes, noises), amplitudes, noises))
         return grids
 
@@ -268,7 +284,7 @@ def fit_lagged(
     """Return the posterior if records are the state; the ``usual`` one is cheap: it learns no hyperparameters."""
     Z, E, _ = history.along(records)
     scaled, rows = Scaled.of(Z, E, pairs, records[0].inputs.shape[1], products), np.ones((len(Z), 1))
-    most_likely = np.full(scaled.states + scaled.inputs + 2, _LENGTH)  # a priori
+    most_likely = np.full(scaled.states + scaled.inputs + 2, np.log(scaled.settings.length))  # a priori
     runs = rows_of_executions(records)
     if usual:
         return _conditioned(history, scaled, most_likely, live, rows, None, runs)

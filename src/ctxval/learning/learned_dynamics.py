@@ -39,8 +39,6 @@ from ctxval.learning.worst_case import WorstCase
 if TYPE_CHECKING:
     from ctxval.learning.dynamics_study import DynamicsStudy
 
-_LARGER = 1.02  # multiple of the friction in motion from which that at rest is named
-
 
 @dataclass(frozen=True, eq=False)
 class LearnedDynamics(ShortRepr):
@@ -231,7 +229,7 @@ class LearnedDynamics(ShortRepr):
                 name, _ = parted(label)
                 sizes[label] = sliding
                 at_most = label.replace(name, f"{name} at rest at most", 1)
-                sizes[at_most] = at_rest if at_rest > _LARGER * sliding else 0.0
+                sizes[at_most] = at_rest if at_rest > 1.02 * sliding else 0.0  # no more than that in motion
                 sizes[f"share of {name}"] = load
         return {label: size for label, size in sizes.items() if size}
 

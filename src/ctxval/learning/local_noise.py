@@ -9,11 +9,16 @@ from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array
 
-_PRIOR = 8.0  # innovations of the average size that each average holds
-_GAIN = 6.0  # least gain of the log likelihood of innovations that were left out
-# Least gain by a split at the best of all places, and the fewest innovations on each side of it.
-_SPLIT_GAIN, _FEWEST = 15.0, 20
-_LEAST = 1e-4  # least relative variance: without it, records without noise would outweigh all others
+
+@dataclass(frozen=True)
+class LocalNoiseSettings:
+    """By how much noise must differ between places to be no chance."""
+
+    prior: float = 8.0  # innovations of the average size that each average holds
+    gain: float = 6.0  # least gain of the log likelihood of innovations that were left out
+    split_gain: float = 15.0  # least gain by a split at the best of all places
+    fewest: int = 20  # fewest innovations on each side of it
+    least: float = 1e-4  # least relative variance: without it, records without noise would outweigh all others
 
 
 @dataclass(frozen=True)
@@ -49,7 +54,9 @@ class LocalNoise:
         return np.asarray(np.sqrt(variances) * (1.0 if self.before is None else self.before(pairs)))
 
 
-def local_noise(pairs: Array, innovations: Array) -> LocalNoise | None:
+def local_noise(
+    pairs: Array, innovations: Array, settings: LocalNoiseSettings = LocalNoiseSettings()
+) -> LocalNoise | None:
     """Return how unit innovations ``(N, k)`` vary over states and inputs; None if a constant is about as likely.
 
     Where noise begins at a place, such as an edge, an average over neighbours would be too small inside: such places
@@ -60,7 +67,7 @@ def local_noise(pairs: Array, innovations: Array) -> LocalNoise | None:
         return None
     squares = (innovations**2).mean(axis=1)
     squares = squares / max(squares.mean(), 1e-300)
-    parts = _parts(pairs, squares, innovations.shape[1])
+    parts = _parts(pairs, squares, innovations.shape[1], settings)
     split = parts if isinstance(parts, Split) else None
     if split is not None:
         squares = squares / split(pairs)
@@ -68,36 +75,36 @@ def local_noise(pairs: Array, innovations: Array) -> LocalNoise | None:
     some = rng.permutation(len(pairs))[:400]
     K = _near(pairs[some], pairs)
     K[np.arange(len(some)), some] = 0.0
-    averages = (K @ squares + _PRIOR) / (K.sum(axis=1) + _PRIOR)
+    averages = (K @ squares + settings.prior) / (K.sum(axis=1) + settings.prior)
     # The log likelihood of normal innovations with these variances, above that with a variance of 1.
     gains = -0.5 * innovations.shape[1] * (np.log(averages) + squares[some] / averages - squares[some])
-    if gains.sum() <= _GAIN:
+    if gains.sum() <= settings.gain:
         return None if split is None else LocalNoise(split, pairs[:0], np.empty(0))
     centres = pairs[rng.permutation(len(pairs))[:80]]
     K = _near(centres, pairs)
-    return LocalNoise(split, centres, (K @ squares + _PRIOR) / (K.sum(axis=1) + _PRIOR))
+    return LocalNoise(split, centres, (K @ squares + settings.prior) / (K.sum(axis=1) + settings.prior))
 
 
-def _parts(pairs: Array, squares: Array, k: int) -> Split | float:
+def _parts(pairs: Array, squares: Array, k: int, settings: LocalNoiseSettings) -> Split | float:
     """Return the variance of squared innovations ``(N,)``, the means of k each, or those on both sides of a split."""
-    n, mean = len(squares), max(float(squares.mean()), _LEAST)
-    if n >= 2 * _FEWEST:
+    n, mean = len(squares), max(float(squares.mean()), settings.least)
+    if n >= 2 * settings.fewest:
         count, order = np.arange(1, n)[:, None], np.argsort(pairs, axis=0, kind="stable")
         ordered, gains = np.take_along_axis(pairs, order, axis=0), list[Array]()
         # Of the log likelihood of normal innovations, and of those with heavier tails: a few large ones, such as hits
         # of a wall, are no noise that begins somewhere.
-        limited = np.maximum(squares, _LEAST)
+        limited = np.maximum(squares, settings.least)
         for values, power in ((limited, 0.5 * k), (np.sqrt(limited), 1.0 * k)):
             total = np.cumsum(values[order], axis=0)
             below, above = total[:-1] / count, (total[-1] - total[:-1]) / (n - count)
             gains.append(power * (n * np.log(values.mean()) - count * np.log(below) - (n - count) * np.log(above)))
         gain = np.minimum(*gains)
-        gain[(ordered[1:] == ordered[:-1]) | (count < _FEWEST) | (n - count < _FEWEST)] = -np.inf
+        gain[(ordered[1:] == ordered[:-1]) | (np.minimum(count, n - count) < settings.fewest)] = -np.inf
         row, j = map(int, np.unravel_index(int(gain.argmax()), gain.shape))
-        if gain[row, j] > _SPLIT_GAIN:
+        if gain[row, j] > settings.split_gain:
             at = float(ordered[row : row + 2, j].mean())
             low = pairs[:, j] <= at
-            return Split(j, at, _parts(pairs[low], squares[low], k), _parts(pairs[~low], squares[~low], k))
+            return Split(j, at, *(_parts(pairs[side], squares[side], k, settings) for side in (low, ~low)))
     return mean
 
 

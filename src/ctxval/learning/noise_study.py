@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,22 +23,31 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.innovations import FilterFit, InnovationsFit, LaggedFit, fit_filter, fit_lagged
-from ctxval.learning.noisy_draws import REPLICATES, NoisyPosterior
+from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.recorded import digest, scheduled
 from ctxval.learning.worst_case import WorstCaseSearch
 
-STRUCTURES = (
-    Structure(0), Structure(1), Structure(2), Structure(3), Structure(0, 3.0), Structure(0, 30.0), Structure(2, 30.0)
-)  # fmt: skip
-WITHOUT_LAGS = tuple(each for each in STRUCTURES if not each.lags)
-EXACT = 1e-3  # share of noise below which records with lags determine the next one
-NOISY = 0.01  # share of noise from which executions of one task differ
-_BETTER, _GOOD = 0.1, 0.02  # share of the error without a history, and of the residual, that a history leaves
-# Standard deviation of the distance of a task over its executions, as a share of the largest distance, that matters.
-MATTERS = 0.01
-_ROUNDING = 1e-5  # standard deviation, as a share of a state's, below which it is rounding
-_TRIED = 32  # tasks of the pool among which those with the largest distances show what noise does
-_TASKS, _RUNS = 6, 10  # these tasks, and how often each of them is run
+
+@dataclass(frozen=True)
+class NoiseSettings:
+    """When executions are noisy, and when they depend on more history than a state and an input."""
+
+    structures: tuple[Structure, ...] = (
+        *(Structure(lags) for lags in range(4)),
+        *(Structure(lags, ratio) for lags, ratio in ((0, 3.0), (0, 30.0), (2, 30.0))),
+    )
+
+    exact: float = 1e-3  # share of noise below which records with lags determine the next one
+    noisy: float = 0.01  # share of noise from which executions of one task differ
+    matters: float = 0.01  # standard deviation of a task's distance that matters, as a share of the largest distance
+    rounding: float = 1e-5  # standard deviation, as a share of a state's, below which it is rounding
+    history_error: float = 0.1  # share of the error without a history that a history leaves at most
+    history_residual: float = 0.02  # the same, as a share of the residual
+    pool: int = 32  # tasks of the pool among which those with the largest distances show what noise does
+    tasks: int = 6  # number of these tasks
+    runs: int = 10  # how often each of them is run
+    replicates: int = 10  # sequences of noise of each draw in a search
+    replicates_alone: int = 4  # the same, if each closed loop is designed and run on its own
 
 
 class NoiseStudy:
@@ -51,29 +60,30 @@ class NoiseStudy:
         search: WorstCaseSearch,
         seed: int,
         quantile: float,
-        structures: Sequence[Structure] = STRUCTURES,
+        settings: NoiseSettings = NoiseSettings(),
     ) -> None:
         self.extended, self.planner, self.search, self.seed, self.quantile = extended, planner, search, seed, quantile
-        self.structures = structures
+        self.settings = settings
         self._structures = Latest[bytes, ChosenStructure](8)
 
     def learn(self, posterior: DynamicsPosterior, records: Sequence[Record]) -> NoisyPosterior | None:
         """Return dynamics with noise; None if task, state and input suffice for executions, or nothing is learned."""
+        settings = self.settings
         # Executions do not follow from task, state and input if noise, or what is not recorded, acts.
-        is_needed = float((posterior.most_probable.noise**2).max()) > NOISY or self._effect(posterior) > MATTERS
-        is_needed = is_needed or self._effect(posterior, _scatter_of(records)) > MATTERS
-        if not is_needed and len(records) >= 3 and any(each.lags for each in self.structures):
+        is_needed = float((posterior.most_probable.noise**2).max()) > settings.noisy
+        is_needed = is_needed or self._effect(posterior) > settings.matters
+        is_needed = is_needed or self._effect(posterior, _scatter_of(records)) > settings.matters
+        if not is_needed and len(records) >= 3 and any(each.lags for each in settings.structures):
             last = records[-1]
             with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError), np.errstate(all="ignore"):
                 mean = posterior.means_without([[len(records) - 1]])
                 predicted = mean.step(last.states[:-1], last.inputs)
-                is_needed = predicted_by_history(posterior, records, self.extended.pairs, predicted)
+                is_needed = predicted_by_history(posterior, records, self.extended.pairs, predicted, settings)
         if not is_needed:
             return None
         some = scheduled(len(records))
         key = digest(records[:some])
-        # There are fewer sequences of noise if each closed loop is designed and run on its own.
-        replicates, learned = REPLICATES if self.planner.batched else 4, None
+        replicates, learned = settings.replicates if self.planner.batched else settings.replicates_alone, None
         if key not in self._structures:
             learned = self._learned(posterior, records[:some], replicates)
             if learned is None:
@@ -88,9 +98,9 @@ class NoiseStudy:
         # executions would be withdrawn for it, though, so it is kept if first records show that there is noise indeed,
         # and no part of the dynamics that is not learned. Estimates of states deviate without noise, too.
         n = len(posterior.data.sizes)
-        scatters = _scatter_of(records)[:n] > _ROUNDING * posterior.data.scale[:n]
-        is_measured = self.extended.given.outputs is None and noisy.noise > NOISY and bool(scatters.any())
-        return noisy if is_measured or self._effect(noisy) > MATTERS else replace(noisy, replicates=1)
+        scatters = _scatter_of(records)[:n] > settings.rounding * posterior.data.scale[:n]
+        is_measured = self.extended.given.outputs is None and noisy.noise > settings.noisy and bool(scatters.any())
+        return noisy if is_measured or self._effect(noisy) > settings.matters else replace(noisy, replicates=1)
 
     def again(
         self, noisy: NoisyPosterior, records: Sequence[Record], posterior: DynamicsPosterior, others: Sequence[Record]
@@ -112,7 +122,7 @@ class NoiseStudy:
         try:
             with single_threaded(), np.errstate(all="ignore"):
                 model, pairs = posterior.with_most_friction, self.extended.pairs
-                fit, chosen = fit_structures(model, records, pairs, data.learned, chosen, self.structures)
+                fit, chosen = fit_structures(model, records, pairs, data.learned, chosen, self.settings)
         except (np.linalg.LinAlgError, InputError, ValueError):  # numbers that are not finite
             return None
         horizon, seed = max(len(record.inputs) for record in records), (self.seed, len(records))
@@ -123,20 +133,21 @@ class NoiseStudy:
 
         If they are given, it is that over starts with such deviations ``(n,)``. The tasks have large finite distances.
         """
-        planner, rounding = self.planner, _ROUNDING * posterior.data.scale[: len(posterior.data.sizes)]
-        noisy = posterior.with_noise(_RUNS, rounding) if starts is None else None
+        planner, settings = self.planner, self.settings
+        rounding = settings.rounding * posterior.data.scale[: len(posterior.data.sizes)]
+        noisy = posterior.with_noise(settings.runs, rounding) if starts is None else None
         if noisy is None and (starts is None or not (starts > rounding).any()):
             return 0.0
         silent = posterior.mean.without_noise()
         with single_threaded(), np.errstate(all="ignore"):
-            tasks = self.search.pool[:_TRIED]
+            tasks = self.search.pool[: settings.pool]
             distances = planner.distances(silent, planner.plan(tasks), len(tasks))[0]
             distances = np.nan_to_num(distances, nan=-1.0, posinf=-1.0)
-            planned = planner.plan(tasks[np.argsort(-distances, kind="stable")[:_TASKS]])
-            runs = np.full((_RUNS, min(_TASKS, len(tasks))), np.nan)
+            planned = planner.plan(tasks[np.argsort(-distances, kind="stable")[: settings.tasks]])
+            runs = np.full((settings.runs, min(settings.tasks, len(tasks))), np.nan)
             if noisy is not None:
                 for plan, loops in zip(planned, planner.run(noisy, planned), strict=True):
-                    runs[: len(loops.distances), plan.rows] = loops.distances[:_RUNS]
+                    runs[: len(loops.distances), plan.rows] = loops.distances[: settings.runs]
             elif starts is not None:
                 rng = np.random.default_rng(0)
                 for run in runs:
@@ -168,7 +179,7 @@ def fit_structures(
     pairs: Array,
     live: Mask,
     chosen: ChosenStructure | None = None,
-    structures: Sequence[Structure] = STRUCTURES,
+    settings: NoiseSettings = NoiseSettings(),
 ) -> tuple[InnovationsFit, ChosenStructure]:
     """Return the posterior of the most probable structure, or of a structure that was chosen before.
 
@@ -188,12 +199,12 @@ def fit_structures(
     if chosen is not None:
         plain = lagged(Structure(0 if chosen.structure.ratio else chosen.structure.lags), chosen.theta)
         return (filtered(chosen.structure, plain) if chosen.structure.ratio else plain), chosen
-    possible = [structure for structure in structures if structure.lags <= max(1, len(records))]
+    possible = [structure for structure in settings.structures if structure.lags <= max(1, len(records))]
     fits: list[InnovationsFit] = [lagged(structure, None) for structure in possible if not structure.ratio]
     of_states, least = fits[0], min(fit.share for fit in fits)
-    exact = [fit for fit in fits if fit.share <= max(10 * least, 1e-6)] if least <= EXACT else []
+    exact = [fit for fit in fits if fit.share <= max(10 * least, 1e-6)] if least <= settings.exact else []
     best = min(exact, key=lambda fit: fit.history.structure.lags) if exact else max(fits, key=_preference)
-    if best.share > NOISY:
+    if best.share > settings.noisy:
         for structure in possible:
             if structure.ratio:
                 with contextlib.suppress(np.linalg.LinAlgError):
@@ -204,7 +215,11 @@ def fit_structures(
 
 
 def predicted_by_history(
-    posterior: DynamicsPosterior, records: Sequence[Record], pairs: Array, without_history: Array
+    posterior: DynamicsPosterior,
+    records: Sequence[Record],
+    pairs: Array,
+    without_history: Array,
+    settings: NoiseSettings,
 ) -> bool:
     """Return whether a history predicts the last record far better than state and input do, or neither predicts it."""
     last, sizes, live = records[-1], posterior.data.sizes, posterior.data.learned
@@ -213,14 +228,14 @@ def predicted_by_history(
         return float(((errors[:, live] / sizes[live]) ** 2).mean(axis=0).max())
 
     without = share(last.states[1:] - without_history)
-    if without < EXACT:
+    if without < settings.exact:
         return False
     shares = []
     for lags in (1, 2, 3):
         history = History(posterior.covariances.model, Structure(lags), np.eye(len(live)))
         fit = fit_lagged(history, records[:-1], pairs, None, live, usual=True)
         with_history = share(history.along([last], fit.residual)[2])
-        if with_history < min(_BETTER * without, _GOOD):
+        if with_history < min(settings.history_error * without, settings.history_residual):
             return True
         shares += [with_history, fit.share]
     # Share of the residual that nothing predicts if there is noise.

@@ -23,10 +23,15 @@ from ctxval.learning.features import Features, LinearFunction
 from ctxval.learning.innovations import DrawnWeights, InnovationsFit
 from ctxval.learning.residual_data import ResidualData
 
-REPLICATES = 10  # sequences of noise of each draw in a search
-ROUGH = 3  # sequences of noise of the mean in a search of tasks, whose best ones are evaluated with all
-_GROUPS, _FUNCTIONS = 5, 4  # draws of the hyperparameters, and usual number of weights for each of them
-SETTLED = 80  # sequences of noise at the tasks that a search has found
+
+@dataclass(frozen=True)
+class NoisyDrawSettings:
+    """Numbers of draws of noisy dynamics, and of their sequences of noise."""
+
+    groups: int = 5  # draws of the hyperparameters
+    functions: int = 4  # usual number of weights for each of them
+    rough: int = 3  # sequences of noise of the mean in a search of tasks, whose best ones are evaluated with all
+    settled: int = 80  # sequences of noise at the tasks that a search has found
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +45,12 @@ class NoisyDraws(Draws):
     quantile: float  # q; the distance of a draw is this quantile over its sequences of noise
     of_runs: Rows | None = None  # the execution whose innovations each sequence has, or -1, (S, R); None without any
     left_out: float = 0.0
+    settings: NoisyDrawSettings = NoisyDrawSettings()
 
     @classmethod
     def of(
         cls, fit: InnovationsFit, groups: Sequence[DrawnWeights], scatter: Array, horizon: int, replicates: int,
-        quantile: float, rng: np.random.Generator,
+        quantile: float, rng: np.random.Generator, settings: NoisyDrawSettings,
     ) -> Self:  # fmt: skip
         """Return draws with fresh noise; the first records scatter with standard deviations ``(n,)``."""
         whole = replicates > 1 and fit.runs.matter
@@ -57,7 +63,7 @@ class NoisyDraws(Draws):
             along = np.array([np.resize(run, horizon) for run in fit.executions])
             rows[:, 1::2] = along[of_runs[:, 1::2]]
         start = scatter * rng.standard_normal((*shape, len(scatter)))
-        return cls(fit, tuple(groups), rows, start, quantile, of_runs)
+        return cls(fit, tuple(groups), rows, start, quantile, of_runs, settings=settings)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -70,7 +76,7 @@ class NoisyDraws(Draws):
     @functools.cached_property
     def searched(self) -> Self:
         """The same with fewer sequences of noise, with which a search finds the same tasks."""
-        rough = ROUGH * self.kinds
+        rough = self.settings.rough * self.kinds
         return self._first(rough) if self.replicates > rough else self
 
     @property
@@ -92,7 +98,8 @@ class NoisyDraws(Draws):
         if self.replicates == 1:
             return self  # there is hardly any noise
         scatter = np.sqrt((self.start**2).mean(axis=(0, 1)))
-        return self.of(self.fit, self.groups, scatter, self.rows.shape[2], SETTLED, self.quantile, rng)
+        settings, horizon = self.settings, self.rows.shape[2]
+        return self.of(self.fit, self.groups, scatter, horizon, settings.settled, self.quantile, rng, settings)
 
     def without_noise(self) -> Self:
         """Return the same residuals without noise."""
@@ -191,12 +198,13 @@ class NoisyPosterior(ShortRepr):
     replicates: int  # sequences of noise of each draw in a search
     quantile: float
     seed: tuple[int, ...]
+    settings: NoisyDrawSettings = NoisyDrawSettings()
 
     has_pivots: ClassVar[bool] = False  # draws are not those of a DynamicsPosterior
 
     def functions_for(self, draws: int) -> int:
         """Return the number of weights for each draw of the hyperparameters that gives at least so many draws."""
-        return max(_FUNCTIONS, -(-draws // _GROUPS))
+        return max(self.settings.functions, -(-draws // self.settings.groups))
 
     @property
     def noise(self) -> float:
@@ -231,11 +239,12 @@ class NoisyPosterior(ShortRepr):
         hyperparameters: int | None = None,
     ) -> NoisyDraws:
         """Return draws; see :meth:`DynamicsPosterior.draw`. Nothing depends on ``relevant``."""
-        groups, each = _GROUPS, _FUNCTIONS if functions is None else functions
+        groups, each = self.settings.groups, self.settings.functions if functions is None else functions
         if hyperparameters is not None:
             groups, each = hyperparameters // 2, 2 * each  # a few for a screening
         return self._with_noise(self.fit.draw(groups, each, rng), rng)
 
     def _with_noise(self, drawn: Sequence[DrawnWeights], rng: np.random.Generator) -> NoisyDraws:
-        draws = NoisyDraws.of(self.fit, drawn, self.scatter, self.horizon, self.replicates, self.quantile, rng)
+        sizes = self.scatter, self.horizon, self.replicates, self.quantile
+        draws = NoisyDraws.of(self.fit, drawn, *sizes, rng, self.settings)
         return draws if self.is_noisy else draws.without_noise()

@@ -24,11 +24,17 @@ from ctxval.learning.residual_data import epsilons, floors, residual_data
 from ctxval.learning.tolerance import pushed
 from ctxval.learning.worst_case import WorstCase
 
-SHARE = 0.01  # share of the threshold up to which a distance is negligible
-_MARGIN = 2.0  # multiple of an executed distance that those of other tasks may have
-_AMPLIFIED = 100.0  # largest factor by which executed distances may exceed those under constant errors
-_WAYS = 8  # number of combinations of signs of a constant error of each state
-_TASKS, _ALONE = 256, 16  # numbers of random tasks under these errors, together and one by one
+
+@dataclass(frozen=True)
+class AgreementSettings:
+    """What counts as an error that matters to no distance, and on which tasks that is tried."""
+
+    share: float = 0.01  # share of the threshold up to which a distance is negligible
+    margin: float = 2.0  # multiple of an executed distance that those of other tasks may have
+    amplified: float = 100.0  # largest factor by which executed distances may exceed those under constant errors
+    ways: int = 8  # combinations of signs of a constant error of each state
+    tasks: int = 256  # random tasks under these errors
+    tasks_alone: int = 16  # the same, if each closed loop is designed and run on its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,18 +57,19 @@ class AgreeingDynamics(LearnedDynamics):
     @functools.cached_property
     def _under_errors(self) -> tuple[Array, Array]:
         """Tasks ``(q, d)``, the executed ones first, and their largest distances if M errs in each step."""
-        planner, data = self.study.planner, self.posterior.data
+        planner, data, settings = self.study.planner, self.posterior.data, self.study.settings.agreement
         x, u, following = data.transitions.x, data.transitions.u, data.transitions.x_next
         with np.errstate(all="ignore"):
             recorded = np.abs(following - self.posterior.covariances.model.step(x, u)).max(axis=0)
         least = np.maximum(epsilons(following) * np.abs(following).max(axis=0), 1e-300)
         # The next power of 2 stays the same after most executions, so that closed loops need not be run again.
         errors = 2 ** np.ceil(np.log2(np.maximum(recorded, least)))
-        points = np.concatenate([self.executed, self.study.search.pool[: _TASKS if planner.batched else _ALONE]])
+        count = settings.tasks if planner.batched else settings.tasks_alone
+        points = np.concatenate([self.executed, self.study.search.pool[:count]])
         known = self.study.under_errors.setdefault(errors.tobytes(), {})
         new = np.array([point for point in points if point.tobytes() not in known])
         if len(new):
-            signs = np.random.default_rng(0).choice([-1.0, 1.0], (_WAYS, len(errors)))
+            signs = np.random.default_rng(0).choice([-1.0, 1.0], (settings.ways, len(errors)))
             with single_threaded(), np.errstate(all="ignore"):
                 moved = planner.distances(pushed(self.posterior.mean, signs * errors), planner.plan(new), len(new))
             largest = np.nan_to_num(moved, nan=0.0, posinf=np.inf).max(axis=0)
@@ -82,11 +89,13 @@ class AgreeingDynamics(LearnedDynamics):
 
         Errors that follow the motion add up to more than constant ones do, which the executed distances show.
         """
-        _, distances = self._under_errors
+        (_, distances), settings = self._under_errors, self.study.settings.agreement
         executed = np.array([self._distance_of(*each) for each in self.executions])
         expected = distances[: len(executed)]
         ratios = np.divide(executed, expected, out=np.zeros(len(executed)), where=expected > 0)
-        return float(distances.max()) * float(np.clip(_MARGIN * ratios.max(initial=0.0), 1.0, _AMPLIFIED))
+        return float(distances.max()) * float(
+            np.clip(settings.margin * ratios.max(initial=0.0), 1.0, settings.amplified)
+        )
 
     def _distance_of(self, point: Array, trajectory: Trajectory) -> float:
         """Return the distance of an execution; 0 if it is not known."""
@@ -109,7 +118,8 @@ class AgreeingDynamics(LearnedDynamics):
         plans = self.study.search.plans
         unplanned = 1 - sum(int(np.sum(plan.nominal.finite)) for plan in plans) / len(self.study.search.pool)
         at = np.repeat(points[order[:1]], len(maxima), axis=0)
-        return WorstCase(maxima, at, self.negligible, points[order], _WAYS * len(points), 0.0, unplanned)
+        loops = self.study.settings.agreement.ways * len(points)
+        return WorstCase(maxima, at, self.negligible, points[order], loops, 0.0, unplanned)
 
     @functools.cached_property
     def worst_of_mean(self) -> WorstCase:

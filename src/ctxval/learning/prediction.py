@@ -33,7 +33,6 @@ from ctxval.searches import Prediction
 Executed = Sequence[tuple[Array, Trajectory]]  # points of the unit cube (d,) with the system's trajectories there
 _KERNEL = Matern(2.5, ard=True, length_scale=(0.05, 100.0), variance=(1e-6, 1e3), linear=(1e-6, 1e3))
 _NOISE = 1e-8  # noise variance relative to the vectors' mean square: it keeps the covariance matrix positive definite
-_LEARNED_FROM = 200  # largest number of vectors, the latest ones, from which the hyperparameters are learned
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,15 +130,20 @@ class ErrorVectors:
         return errors if errors.ndim == 2 and np.isfinite(errors).all() else None
 
 
-def predict_composed(points: Array, vectors: Array, compose: Callable[[Array], Array]) -> Prediction | None:
-    """Return a prediction of values composed of vectors ``(n, k)`` at points; None for less than two, or only zeros."""
+def predict_composed(
+    points: Array, vectors: Array, compose: Callable[[Array], Array], learned_from: int = 200
+) -> Prediction | None:
+    """Return a prediction of values composed of vectors ``(n, k)`` at points; None for less than two, or only zeros.
+
+    Hyperparameters are learned from so many vectors, the latest ones.
+    """
     if points.ndim != 2 or vectors.ndim != 2 or len(points) != len(vectors):
         raise ShapeError(f"points must be (n, d) and vectors (n, k), got {points.shape}, {vectors.shape}.")
     scale = float(np.sqrt((vectors**2).mean())) if len(vectors) else 0.0
     if len(vectors) < 2 or scale == 0:
         return None
     with single_threaded():
-        theta = _most_likely(points[-_LEARNED_FROM:], vectors[-_LEARNED_FROM:] / scale)
+        theta = _most_likely(points[-learned_from:], vectors[-learned_from:] / scale)
     process = MultiOutputProcess(_KERNEL, theta, points, vectors / scale, _NOISE)
 
     def expected(at: Array) -> tuple[Array, Array]:

@@ -16,8 +16,6 @@ from ctxval.core.validation import Validation
 from ctxval.learning.histories import Record
 from ctxval.models.increments import standard_deviations
 
-_POOL = 3000  # largest number of transitions that these are chosen from
-
 
 def data_near(model: Model, loops: Trajectory) -> Transitions | None:
     """Return the transitions that a model was made from, of many those nearest to closed loops on M; None if none."""
@@ -31,11 +29,12 @@ def recorded_transitions(
     executed: Sequence[Trajectory],
     loops: Trajectory,
     logged: Sequence[Trajectory] = (),
+    most: int = 3000,
 ) -> tuple[Transitions, Rows] | None:
     """Return the known transitions of the system and the execution of each; -1 for data that the model was made from.
 
-    Returns None if there are none. Of many transitions, a random part is returned, and of recordings that belong to no
-    task, those near closed loops on M; the numbers of these recordings follow those of the executions.
+    Returns None if there are none. Of more than ``most`` transitions, a random part is returned, and of recordings that
+    belong to no task, those near closed loops on M; the numbers of these recordings follow those of the executions.
     """
     parts = [with_memory(model, trajectory) for trajectory in executed]
     sources = [np.full(len(part), k) for k, part in enumerate(parts)]
@@ -52,8 +51,8 @@ def recorded_transitions(
     if not parts:
         return None
     together, of = Transitions.joined(parts), np.concatenate(sources)
-    if len(of) > _POOL:
-        kept = np.sort(np.random.default_rng(len(of)).permutation(len(of))[:_POOL])
+    if len(of) > most:
+        kept = np.sort(np.random.default_rng(len(of)).permutation(len(of))[:most])
         together, of = together[kept], of[kept]
     return together, of
 
@@ -78,7 +77,7 @@ def _nearest(data: Transitions, loops: Trajectory, count: int, *, many: bool = F
     """Return at most so many rows of transitions: those that are nearest to the closed loops of the tasks."""
     needed = loops.transitions()
     there = np.concatenate([needed.x, needed.u], axis=1)
-    there = there[np.isfinite(there).all(axis=1)][:: max(1, len(there) // _POOL)]
+    there = there[np.isfinite(there).all(axis=1)][:: max(1, len(there) // 3000)]
     if len(data) <= count or not len(there):
         return np.arange(len(data))
     here = np.concatenate([data.x, data.u], axis=1)

@@ -33,12 +33,16 @@ from ctxval.learning.dynamics_posterior import (
 )
 from ctxval.learning.residual_data import residual_data
 
-_IRREGULAR = 5.0  # standardised error of the regular part from which a transition is irregular
-_SHARE = 0.01  # error that is regular in any case, as a share of a state's regular residual
-_ROUNDS = 4
-_MOST = 0.3  # largest share of the executed transitions that may be irregular
-_OVERLAP = 0.01  # share of the regular states that a discriminant may have on the irregular side
-_RIDGE = 1e-3
+
+@dataclass(frozen=True)
+class RegularSettings:
+    """Which transitions are irregular, and how clearly their states must differ from those of the others."""
+
+    irregular: float = 5.0  # standardised error of the regular part from which a transition is irregular
+    exact: float = 0.01  # error that is regular in any case, as a share of a state's regular residual
+    rounds: int = 4  # largest number of times that the regular part is learned
+    most: float = 0.3  # largest share of the executed transitions that may be irregular
+    overlap: float = 0.01  # share of the regular states that a discriminant may have on the irregular side
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +54,7 @@ class RegularTransitions:
     transitions: Transitions
     sources: Rows
     regular: Mask  #: which are regular, ``(N,)``
+    settings: RegularSettings
 
     @property
     def irregular(self) -> int:
@@ -64,32 +69,37 @@ class RegularTransitions:
         if posterior is None or not np.isfinite(posterior.most_probable.weights).all():
             return None
         others = self.transitions[np.flatnonzero(~self.regular & kept & (self.sources >= 0))]
-        return posterior, Boundary.between(posterior, others)
+        return posterior, Boundary.between(posterior, others, self.settings.overlap)
 
 
 def split_transitions(
-    model: Model, transitions: Transitions, sources: Rows, seed: tuple[int, ...], settings: PosteriorSettings
+    model: Model,
+    transitions: Transitions,
+    sources: Rows,
+    seed: tuple[int, ...],
+    of_posterior: PosteriorSettings,
+    settings: RegularSettings = RegularSettings(),
 ) -> RegularTransitions | None:
     """Return the regular and the irregular transitions; None if there are no irregular ones, or too many."""
     data = residual_data(model, transitions, sources)
     if data is None or len(data.pairs) < len(transitions):
         return None
-    regular = _errors_of_quadratic(data.pairs, data.outputs[:, data.learned]) <= _IRREGULAR + 1
+    regular = _errors_of_quadratic(data.pairs, data.outputs[:, data.learned]) <= settings.irregular + 1
     before, covariances = list[bytes](), None
-    for _ in range(_ROUNDS):
+    for _ in range(settings.rounds):
         before.append(regular.tobytes())
         rows = np.flatnonzero(regular)
-        covariances = learn_covariances(model, transitions[rows], sources[rows], seed, settings)
+        covariances = learn_covariances(model, transitions[rows], sources[rows], seed, of_posterior)
         if covariances is None:
             return None
         posterior = condition(covariances, transitions[rows], sources[rows])
         if posterior is None:
             return None
-        regular = _is_regular(posterior, transitions, regular)
+        regular = _is_regular(posterior, transitions, regular, settings)
         if regular.tobytes() in before:
             break
-    split = covariances and RegularTransitions(covariances, transitions, sources, regular)
-    return split if split and 0 < split.irregular <= _MOST * (sources >= 0).sum() else None
+    split = covariances and RegularTransitions(covariances, transitions, sources, regular, settings)
+    return split if split and 0 < split.irregular <= settings.most * (sources >= 0).sum() else None
 
 
 def _errors_of_quadratic(Z: Array, Y: Array) -> Array:
@@ -104,7 +114,9 @@ def _errors_of_quadratic(Z: Array, Y: Array) -> Array:
     return np.asarray(standardised)
 
 
-def _is_regular(posterior: DynamicsPosterior, transitions: Transitions, regular: Mask) -> Mask:
+def _is_regular(
+    posterior: DynamicsPosterior, transitions: Transitions, regular: Mask, settings: RegularSettings
+) -> Mask:
     """Return which transitions the posterior has, as far as it knows them."""
     data, most = posterior.data, posterior.most_probable
     learned = data.learned
@@ -115,7 +127,7 @@ def _is_regular(posterior: DynamicsPosterior, transitions: Transitions, regular:
         sizes = np.sqrt(most.squares / len(most.centres))
         doubts = np.sqrt(np.maximum(most.whitened(pairs)[1], 0.0))[:, None] * sizes
     usual = 1.48 * np.median(errors[regular], axis=0)
-    return np.asarray((errors <= _IRREGULAR * np.sqrt(doubts**2 + usual**2 + _SHARE**2)).all(axis=1))
+    return np.asarray((errors <= settings.irregular * np.sqrt(doubts**2 + usual**2 + settings.exact**2)).all(axis=1))
 
 
 # Where the regular part ends
@@ -143,8 +155,11 @@ class Boundary:
     discriminants: tuple[Discriminant, ...]
 
     @classmethod
-    def between(cls, posterior: DynamicsPosterior, irregular: Transitions) -> Boundary:
-        """Return the boundary between the executed transitions of a posterior and irregular ones."""
+    def between(cls, posterior: DynamicsPosterior, irregular: Transitions, overlap: float) -> Boundary:
+        """Return the boundary between the executed transitions of a posterior and irregular ones.
+
+        A discriminant of states may have a share ``overlap`` of the regular ones on the irregular side.
+        """
         if not len(irregular):
             return cls(())
         data, n = posterior.data, len(posterior.data.sizes)
@@ -158,8 +173,8 @@ class Boundary:
         ends = np.where(np.isfinite(ends).all(axis=2, keepdims=True), ends, ends[:1])
         discriminants = []
         for columns in [*combinations(range(n), 1), *combinations(range(n), 2)]:
-            discriminant, overlap = _separated(regular[:, columns], ends[..., columns], columns)
-            if overlap <= _OVERLAP:
+            discriminant, beyond = _separated(regular[:, columns], ends[..., columns], columns)
+            if beyond <= overlap:
                 discriminants.append(discriminant)
         every = tuple(range(pairs.shape[1]))
         return cls((*discriminants, _separated(pairs, others[None], every)[0]))
@@ -194,7 +209,7 @@ def _largest_margin(low: Array, high: Array) -> Array:
     """Return weights ``(f,)`` by Newton's method on squared errors, both kinds equal (Keerthi and DeCoste 2005)."""
     F, y = np.concatenate([low, high]), np.concatenate([-np.ones(len(low)), np.ones(len(high))])
     share = np.where(y < 0, 0.5 / len(low), 0.5 / len(high))
-    ridge, active = np.diag([1e-9, *[_RIDGE] * (F.shape[1] - 1)]), np.ones(len(y), dtype=np.bool_)
+    ridge, active = np.diag([1e-9, *[1e-3] * (F.shape[1] - 1)]), np.ones(len(y), dtype=np.bool_)
     for _ in range(50):
         weighted = F[active] * share[active, None]
         weights = np.linalg.solve(weighted.T @ F[active] + ridge, weighted.T @ y[active])

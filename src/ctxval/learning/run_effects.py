@@ -15,12 +15,15 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
 
-_SIZES = np.logspace(-1.5, 1.0, 11)  # tau, in root mean squares of the innovations
-_WITHIN = np.array([1.0, 0.9, 0.75, 0.5, 0.25, 0.1])  # standard deviations of w
-_GAIN = 3.0  # gain of the log likelihood of a state's innovations from which executions differ
-_CORRELATED = 4.0  # standard deviations of a correlation of successive innovations from which they are not independent
-_FEWEST, _PERMUTATIONS = 6, 999  # executions from which on it is tested whether effects change with something
-_CLIPPED = 3.0  # standard deviations to which states and inputs are limited: effects are not extrapolated
+
+@dataclass(frozen=True)
+class RunEffectSettings:
+    """When executions differ by more than independent steps do."""
+
+    gain: float = 3.0  # gain of the log likelihood of a state's innovations from which executions differ
+    correlation: float = 4.0  # standard deviations of a correlation of successive innovations that are not independent
+    fewest: int = 6  # executions from which on it is tested whether effects change with something
+    permutations: int = 999  # of these tests
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +35,12 @@ class RunEffects:
     within: Array  # w, (N, n)
     gain: float  # the largest gain of the log likelihood of a state's innovations by such effects
     correlation: float  # the largest correlation of a state's successive innovations w, in its standard deviations
+    settings: RunEffectSettings = RunEffectSettings()
 
     @property
     def matter(self) -> bool:
         """Whether innovations that are drawn step by step are no executions."""
-        return self.gain > _GAIN or self.correlation > _CORRELATED
+        return self.gain > self.settings.gain or self.correlation > self.settings.correlation
 
     def drift(self, columns: Array) -> tuple[int, float] | None:
         """Return the column ``(K, c)`` with which the effects change most, and the p-value of a permutation test.
@@ -44,11 +48,12 @@ class RunEffects:
         The effects are summarised by their first principal component. It is None if there are none, or too few.
         """
         flat = self.effects.reshape(len(self.effects), -1)
-        if not self.matter or len(flat) < _FEWEST or not flat.any():
+        if not self.matter or len(flat) < self.settings.fewest or not flat.any():
             return None
         component = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)[0][:, 0]
         rng = np.random.default_rng(len(flat))
-        orders = np.stack([np.arange(len(flat)), *(rng.permutation(len(flat)) for _ in range(_PERMUTATIONS))])
+        shuffled = [rng.permutation(len(flat)) for _ in range(self.settings.permutations)]
+        orders = np.stack([np.arange(len(flat)), *shuffled])
         centred = columns - columns.mean(axis=0)
         unit = centred / np.maximum(np.linalg.norm(centred, axis=0), 1e-300)
         alike = np.abs(component[orders] @ unit)
@@ -61,8 +66,11 @@ class RunEffects:
 
 
 def regressors(pairs: Array) -> Array:
-    """Return the regressors ``(N, 1 + n + m)`` of effects at standardised states and inputs ``(N, n + m)``."""
-    return np.concatenate([np.ones((len(pairs), 1)), np.clip(pairs, -_CLIPPED, _CLIPPED)], axis=1)
+    """Return the regressors ``(N, 1 + n + m)`` of effects at standardised states and inputs ``(N, n + m)``.
+
+    These are limited to three standard deviations, because effects are not extrapolated.
+    """
+    return np.concatenate([np.ones((len(pairs), 1)), np.clip(pairs, -3.0, 3.0)], axis=1)
 
 
 def run_effects(
@@ -73,7 +81,8 @@ def run_effects(
     ``hats`` are the features ``(N, F)`` of the residual of each learned state and the inverse ``(F, F)`` of their
     regularised second moments; None if innovations are those of a filter, which has no hat matrix.
     """
-    Phi = regressors(pairs)
+    Phi, sizes = regressors(pairs), np.logspace(-1.5, 1.0, 11)  # tau, in root mean squares of the innovations
+    deviations = np.array([1.0, 0.9, 0.75, 0.5, 0.25, 0.1])  # of w
     effects, within = np.zeros((len(rows), Phi.shape[1], innovations.shape[1])), innovations.copy()
     gain = correlation = 0.0
     for place, i in enumerate(np.flatnonzero(live)):
@@ -89,14 +98,14 @@ def run_effects(
         values, projected = (np.array([each[k] for each in spectra]) for k in (0, 2))
         squares = float((innovations[:, i] ** 2).sum())
         # The log likelihood for tau (rows) and the standard deviations of w (columns).
-        s2, t2 = _WITHIN[None, :, None, None] ** 2, np.concatenate([[0.0], _SIZES**2])[:, None, None, None]
+        s2, t2 = deviations[None, :, None, None] ** 2, np.concatenate([[0.0], sizes**2])[:, None, None, None]
         explained = (t2 * projected**2 / (s2 * (s2 + t2 * values))).sum(axis=(2, 3))
         volume = np.log1p(t2 * values / s2).sum(axis=(2, 3)) + len(innovations) * np.log(s2[..., 0, 0])
         heights = -0.5 * (volume + np.maximum(squares / s2[..., 0, 0] - explained, 0.0))
         j, k = np.unravel_index(int(heights.argmax()), heights.shape)
         gain = max(gain, float(heights.max() - heights[0].max()))
         if j:
-            ridge = (_WITHIN[k] / _SIZES[j - 1]) ** 2
+            ridge = (deviations[k] / sizes[j - 1]) ** 2
             for number, (of_run, vectors, onto) in enumerate(spectra):
                 effects[number, :, i] = vectors @ (onto / (of_run + ridge))
                 within[rows[number], i] -= Phi[rows[number]] @ effects[number, :, i]

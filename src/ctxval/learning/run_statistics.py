@@ -1,8 +1,8 @@
 """How far single executions are from what others predict: positive statistics of each run, one of each kind.
 
 Each statistic is about 1 or less if the learned dynamics and their doubt are right, and if what is missing moves
-distances by less than ``NEGLIGIBLE`` of the threshold. The residuals of a state give two: their mean square, and that
-of their part that is linear in state and input, which shows what noise hides of a heavier load or a weaker motor.
+distances by less than a negligible share of the threshold. The residuals of a state give two: their mean square, and
+that of their part that is linear in state and input, which shows what noise hides of a heavier load or a weaker motor.
 """
 
 from __future__ import annotations
@@ -21,9 +21,6 @@ from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.tolerance import pushed
 
-NEGLIGIBLE = 0.01  # share of the threshold: what moves no distance by so much is no change
-_LEAST, _MOST = 1e-6, 0.3  # limits of negligible residuals, as shares of a state's typical step
-
 
 @dataclass(frozen=True, eq=False)
 class RunStatistics:
@@ -40,11 +37,17 @@ class RunStatistics:
         return cls(learned, threshold, influences(learned))
 
     @property
+    def negligible(self) -> float:
+        """The distance that is no change if residuals move none by more."""
+        return self.learned.study.settings.agreement.share * self.threshold
+
+    @property
     def floors(self) -> Array:
         """The residuals of each state that move no distance by more than a negligible share, shape ``(n,)``."""
         steps = self.learned.posterior.data.steps
         largest = np.maximum(self.influences.max(axis=1), 1e-300)
-        return np.asarray(np.clip(NEGLIGIBLE * self.threshold / largest, _LEAST * steps, _MOST * steps))
+        # Limits of negligible residuals are shares of a state's typical step.
+        return np.asarray(np.clip(self.negligible / largest, 1e-6 * steps, 0.3 * steps))
 
     @property
     def has_noise(self) -> bool:
@@ -96,7 +99,7 @@ class RunStatistics:
             with contextlib.suppress(Exception):  # the user's parts, at states that no execution has reached
                 predicted = learned.predict(point)
             if predicted is not None and np.isfinite(predicted.median):
-                least = (NEGLIGIBLE * self.threshold) ** 2
+                least = self.negligible**2
                 error = (distance - predicted.median) ** 2
                 statistics[DISTANCE] = Statistic(float((error + least) / (predicted.deviation**2 + least)), freedom=1.0)
         return statistics

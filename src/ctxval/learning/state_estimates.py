@@ -7,6 +7,7 @@ recorded, beside what it misses in the other states, is chosen by how well the f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -21,19 +22,23 @@ from ctxval.learning.prediction import Executed
 from ctxval.models.corrected import before_refinement
 from ctxval.models.increments import standard_deviations
 
-# What M misses in recorded directions, beside what it misses in all others, as shares of their steps.
-_SHARES = np.array([1.0, 1e-1, 1e-2, 1e-3, 1e-4])
-
 
 class StateEstimates:
     """The states of M along executions, estimated from their inputs and outputs; they are kept like these.
 
     A refined model is estimated as the model before, whose residual is learned. States of closed loops on M
-    ``(..., H + 1, n)`` have typical changes in one step.
+    ``(..., H + 1, n)`` have typical changes in one step. What M misses in recorded directions is one of the ``shares``
+    of what it misses in all others, in units of their steps.
     """
 
-    def __init__(self, validation: Validation, outputs: Outputs, states: Array) -> None:
-        self.validation, self.outputs = validation, outputs
+    def __init__(
+        self,
+        validation: Validation,
+        outputs: Outputs,
+        states: Array,
+        shares: Sequence[float] = (1.0, 1e-1, 1e-2, 1e-3, 1e-4),
+    ) -> None:
+        self.validation, self.outputs, self.shares = validation, outputs, np.array(shares)
         changes = np.diff(states, axis=-2).reshape(-1, states.shape[-1])
         steps = standard_deviations(changes[np.isfinite(changes).all(axis=1)])
         self.steps = np.maximum(steps, 1e-9 * max(float(steps.max(initial=0.0)), 1e-300))
@@ -53,7 +58,9 @@ class StateEstimates:
                         task = self.validation.task(space.parameters(space.from_unit(point)))
                         start = np.asarray(task.initial_state, dtype=np.float64)
                         recorded = trajectory.states, trajectory.inputs
-                        self._known[trajectory] = smoothed_states(model, self.outputs, start, *recorded, self.steps)
+                        self._known[trajectory] = smoothed_states(
+                            model, self.outputs, start, *recorded, self.steps, self.shares
+                        )
         except Exception:  # the user's parts, at states that M never reaches by itself
             return None
         known = [(*self._known[trajectory], trajectory) for _, trajectory in executed]
@@ -73,7 +80,7 @@ class StateEstimates:
 
 
 def smoothed_states(
-    model: Model, outputs: Outputs, start: Array, y: Array, u: Array, steps: Array
+    model: Model, outputs: Outputs, start: Array, y: Array, u: Array, steps: Array, shares: Array
 ) -> tuple[Array, Array]:
     """Return the most probable states of a model with these inputs and outputs, and how well outputs are predicted.
 
@@ -81,15 +88,15 @@ def smoothed_states(
     misses in recorded directions. They begin at a state ``(n,)`` before the first of the outputs y ``(H + 1, p)``
     correct it, have inputs u ``(H, m)``, and change by typical steps ``(n,)``.
     """
-    k, scale = len(_SHARES), np.diag(steps)
+    k, scale = len(shares), np.diag(steps)
     C = outputs.jacobian(start) @ scale
     # The recorded directions of the space in which each state is measured in its steps.
     recorded = np.linalg.pinv(C) @ C
-    shares = _SHARES[:, None, None] * recorded + np.eye(len(steps)) - recorded
-    process = scale @ shares @ np.swapaxes(shares, -1, -2) @ scale
+    roots = shares[:, None, None] * recorded + np.eye(len(steps)) - recorded
+    process = scale @ roots @ np.swapaxes(roots, -1, -2) @ scale
     spreads = np.sqrt(np.maximum(np.einsum("ij,ij->i", C, C), 1e-300))
     # Error of the recorded outputs, as a share of their smallest step: they are reproduced.
-    measurement = np.diag((1e-6 * _SHARES[-1] * spreads) ** 2)
+    measurement = np.diag((1e-6 * shares[-1] * spreads) ** 2)
     inputs = np.repeat(u[:, None], k, axis=1)
     known, _ = corrected(outputs, Estimate(np.repeat(start[None], k, axis=0), process), y[0], measurement)
     steps_back, innovations = list[tuple[Estimate, Array, Estimate]](), list[Array]()

@@ -20,7 +20,6 @@ from ctxval.learning.draws import DisturbedDynamics, DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
 LEVELS = np.array([0.0, *2.0 ** np.arange(-4, 4)])  # sizes of pushes, as multiples of the largest recorded residual
-NEAR = 0.05  # largest distance to a recorded state of what it shows, as a share of the range of each state
 
 
 def push_response(
@@ -57,15 +56,22 @@ def push_response(
 
 
 def pushed(
-    mean: DynamicsDraws, pushes: Array, widths: Array | float = 1.0, recorded: cKDTree | None = None
+    mean: DynamicsDraws,
+    pushes: Array,
+    widths: Array | float = 1.0,
+    recorded: cKDTree | None = None,
+    near: float = 0.05,
 ) -> DisturbedDynamics:
-    """Return a model that is pushed by ``(S, n)``, everywhere or away from records, in units of the widths ``(n,)``."""
+    """Return a model that is pushed by ``(S, n)``, everywhere or away from records, in units of the widths ``(n,)``.
+
+    A record shows the states that are ``near`` it in each coordinate.
+    """
 
     def added(ways: Rows, x: Array) -> Array:
         if recorded is None:
             return np.asarray(pushes[ways, None])
         scaled = np.clip(np.nan_to_num(x / widths), -1e6, 1e6)
-        distance, _ = recorded.query(scaled, p=np.inf, distance_upper_bound=NEAR)
+        distance, _ = recorded.query(scaled, p=np.inf, distance_upper_bound=near)
         return np.asarray(pushes[ways, None] * np.isinf(distance)[..., None])
 
     return DisturbedDynamics(mean, np.arange(len(pushes)), added)

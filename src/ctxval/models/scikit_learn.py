@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,9 +22,9 @@ from ctxval.models.smooth_maps import Kernel, Slope, Slopes, SmoothMap
 class ScikitLearn:
     """A fitted scikit-learn regressor as a model: a pipeline, a forest, ridge regression, a Gaussian process.
 
-    Its features are the state, then the input. Networks, Gaussian processes, kernel ridge regression, linear models,
-    and pipelines of these with scalers and polynomial features, have an exact Jacobian from their formula; all others
-    are differentiated by central differences. A forest or nearest neighbours are piecewise constant: their Jacobian is
+    Its features are the state, then the input. Networks, Gaussian processes, linear models, and pipelines of these with
+    standard scalers and polynomial features, have an exact Jacobian from their formula; all others are differentiated
+    by central differences. A forest or nearest neighbours are piecewise constant: their Jacobian is
     zero, with which LQR and iLQR cannot design.
 
     Args:
@@ -138,21 +138,16 @@ def smooth_map(regressor: Any) -> SmoothMap | None:
             kernel = None if centres is None else _covariance(regressor.kernel_)
             if kernel is None or not isinstance(centres, np.ndarray) or centres.ndim != 2:
                 return None
-            process = maps.kernel_sum(kernel, centres, _columns(regressor.alpha_))
+            process = maps.kernel_sum(kernel, centres, _as_columns(regressor.alpha_))
             return maps.chain([process, maps.scaled(regressor._y_train_std, regressor._y_train_mean)])
-        case "KernelRidge" if isinstance(regressor.X_fit_, np.ndarray):
-            kernel = _ridge_kernel(regressor, regressor.X_fit_.shape[1])
-            return kernel and maps.kernel_sum(kernel, regressor.X_fit_, _columns(regressor.dual_coef_))
-        case "MultiOutputRegressor":
-            return _composed(maps.side_by_side, [smooth_map(estimator) for estimator in regressor.estimators_])
         case "Pipeline":
             *before, (_, last) = regressor.steps
             used = [part for _, part in before if part is not None and part != "passthrough"]
-            return _composed(maps.chain, [*map(_transformer, used), smooth_map(last)])
+            return _chained([*map(_transformer, used), smooth_map(last)])
         case "TransformedTargetRegressor":
             forward = _scaler(regressor.transformer_)
             inverse = None if forward is None else maps.scaled(1.0 / forward[0], -forward[1] / forward[0])
-            return _composed(maps.chain, [smooth_map(regressor.regressor_), inverse])
+            return _chained([smooth_map(regressor.regressor_), inverse])
     return None
 
 
@@ -162,15 +157,9 @@ def _name(part: Any) -> str:
     return kind.__name__ if kind.__module__.startswith("sklearn.") else ""
 
 
-def _composed(
-    compose: Callable[[Sequence[SmoothMap]], SmoothMap], parts: Sequence[SmoothMap | None]
-) -> SmoothMap | None:
+def _chained(parts: Sequence[SmoothMap | None]) -> SmoothMap | None:
     known = [part for part in parts if part is not None]
-    return compose(known) if len(known) == len(parts) else None
-
-
-def _columns(weights: Array) -> Array:
-    return weights[:, None] if weights.ndim == 1 else weights
+    return maps.chain(known) if len(known) == len(parts) else None
 
 
 # Transformers of features and targets
@@ -179,50 +168,22 @@ def _columns(weights: Array) -> Array:
 def _transformer(part: Any) -> SmoothMap | None:
     if _name(part) == "PolynomialFeatures":
         return maps.monomials(part.powers_)
-    if _name(part) == "PCA" and not part.whiten:
-        return maps.affine(part.components_.T, -part.mean_ @ part.components_.T)
     scaler = _scaler(part)
     return None if scaler is None else maps.scaled(*scaler)
 
 
 def _scaler(part: Any) -> tuple[Array | float, Array | float] | None:
     """Return the scale and the shift by which a scaler transforms columns; None if it is not known."""
-
-    def centred(centre: Array | None, scale: Array | None) -> tuple[Array | float, Array | float]:
-        factor = 1.0 if scale is None else 1.0 / scale
-        return factor, 0.0 if centre is None else -centre * factor
-
     match _name(part):
-        case "MinMaxScaler" if not part.clip:
-            return part.scale_, part.min_
         case "StandardScaler":
-            return centred(part.mean_ if part.with_mean else None, part.scale_)
-        case "RobustScaler":
-            centre, scale = part.with_centering, part.with_scaling
-            return centred(part.center_ if centre else None, part.scale_ if scale else None)
-        case "MaxAbsScaler" if not getattr(part, "clip", False):
-            return centred(None, part.scale_)
+            factor = 1.0 if part.scale_ is None else 1.0 / part.scale_
+            return factor, -part.mean_ * factor if part.with_mean else 0.0
         case "FunctionTransformer" if part.func is None and part.inverse_func is None:
             return 1.0, 0.0
     return None
 
 
 # Kernels between new points and known ones
-
-
-def _ridge_kernel(regressor: Any, features: int) -> Kernel | None:
-    gamma = 1.0 / features if regressor.gamma is None else float(regressor.gamma)
-    shift, degree = regressor.coef0, regressor.degree
-    match regressor.kernel:
-        case "rbf":
-            return maps.matern(float((2 * gamma) ** -0.5), np.inf)
-        case "linear":
-            return _of_products(lambda p: p, lambda p: 1.0)
-        case "poly" | "polynomial":
-            return _of_products(
-                lambda p: (gamma * p + shift) ** degree, lambda p: gamma * degree * (gamma * p + shift) ** (degree - 1)
-            )
-    return None
 
 
 def _covariance(kernel: Any) -> Kernel | None:
@@ -236,23 +197,10 @@ def _covariance(kernel: Any) -> Kernel | None:
             return maps.matern(kernel.length_scale, np.inf)
         case "Matern" if kernel.nu in (0.5, 1.5, 2.5, np.inf):
             return maps.matern(kernel.length_scale, kernel.nu)
-        case "DotProduct":
-            offset = float(kernel.sigma_0) ** 2
-            return _of_products(lambda p: p + offset, lambda p: 1.0)
         case "Sum" | "Product" as name:
             first, second = _covariance(kernel.k1), _covariance(kernel.k2)
             return first and second and _joined(first, second, is_sum=name == "Sum")
     return None
-
-
-def _of_products(function: Callable[[Array], Array], slope: Callable[[Array], Any]) -> Kernel:
-    """Return a function of the inner product x'z as a kernel, from the function and its derivative."""
-
-    def kernel(Z: Array, X: Array) -> tuple[Array, Slopes]:
-        products = Z @ X.T
-        return function(products), lambda: [(slope(products), 0.0, 1.0)]
-
-    return kernel
 
 
 def _times(slopes: list[Slope], other: Array | float) -> list[Slope]:

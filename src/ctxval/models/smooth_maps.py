@@ -149,22 +149,6 @@ def total(first: SmoothMap, second: SmoothMap) -> SmoothMap:
     return SmoothMap(linearised, first.constant and second.constant, first.block)
 
 
-def side_by_side(parts: Sequence[SmoothMap]) -> SmoothMap:
-    """Return several maps of the same rows, whose values are joined."""
-
-    def linearised(Z: Array) -> tuple[Array, PullBack]:
-        values, pulls = zip(*(part.linearised(Z) for part in parts), strict=True)
-        ends = np.cumsum([part.shape[1] for part in values])
-
-        def pull_back(G: Array) -> Array:
-            pieces = np.split(G, ends[:-1], axis=2)
-            return np.asarray(np.sum([pull(piece) for pull, piece in zip(pulls, pieces, strict=True)], axis=0))
-
-        return np.concatenate(values, axis=1), pull_back
-
-    return SmoothMap(linearised, constant=all(part.constant for part in parts))
-
-
 # Sums of kernels around centres (Rasmussen and Williams 2006, chapter 4)
 
 Slope = tuple[Array | float, float, Array | float]

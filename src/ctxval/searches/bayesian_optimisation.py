@@ -23,10 +23,16 @@ from ctxval.gp.acquisition import Acquisition, LogExpectedImprovement, UpperConf
 from ctxval.gp.surrogate import SurrogateHyperparameters, kept_rows, learn
 from ctxval.searches.base import Note, SequentialSearch, best_first
 
-_WORTH = 0.005  # least improvement worth an execution, as a share of the best value's excess over the median
-_EVERYWHERE = 4  # period of executions from the whole cube, also in a branch; in few dimensions they fill the space
-_BOUND = 3  # period of executions that maximise the upper confidence bound
 _ENGINE = "scalar"  # the name of this search in notes of existing stores, so it differs from that of the class
+
+
+@dataclass(frozen=True)
+class BayesianSettings:
+    """When an improvement is worth an execution, and how often what the surrogate does not expect is tried."""
+
+    worth: float = 0.005  # least improvement, as a share of the best value's excess over the median
+    everywhere: int = 4  # period of executions from the whole cube, also in a branch; few dimensions are filled
+    bound: int = 3  # period of executions that maximise the upper confidence bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +57,8 @@ class BayesianOptimisation(SequentialSearch):
         beta: confidence parameter of the upper confidence bounds.
     """
 
+    settings = BayesianSettings()
+
     def __init__(self, initial: PositiveInt = 3, beta: NonNegativeFloat = 4.0) -> None:
         self.initial, self.beta = initial, beta
 
@@ -68,7 +76,7 @@ class BayesianOptimisation(SequentialSearch):
         if len(values) < self.initial or np.isfinite(values).sum() < 2:
             point = _filling(points, rng) if few and len(points) else rng.random(self.dimension)
             return point, {"engine": _ENGINE, "how": "initial"}
-        if few and len(values) % _EVERYWHERE == 0:
+        if few and len(values) % self.settings.everywhere == 0:
             return _filling(points, rng), {"engine": _ENGINE, "how": "filling"}
         with single_threaded():
             return self._most_worth(points, values, rng)
@@ -78,15 +86,20 @@ class BayesianOptimisation(SequentialSearch):
         learned = self._learned(points[known], values[known])
         rows = kept_rows(points, values, 1000)
         process = learned.condition(points[rows], values[rows])
-        branch = None if len(values) % _EVERYWHERE == 0 else _branch(points[known], values[known])
+        branch = (
+            None
+            if len(values) % self.settings.everywhere == 0
+            else _branch(points[known], values[known], self.settings.worth)
+        )
         if branch is not None and not np.isfinite(branch.best):
             # Be bold, far from the maximum that was left: near it, the branch would only lead back to it.
             acquisition: Acquisition = UpperConfidenceBound(process, 100.0)
-        elif len(values) % _BOUND == _BOUND - 1:
+        elif len(values) % self.settings.bound == self.settings.bound - 1:
             acquisition = UpperConfidenceBound(process, self.beta)
         else:
             largest = float(np.nanmax(values))
-            least = (largest if branch is None else branch.best) + _WORTH * float(largest - np.nanmedian(values))
+            excess = float(largest - np.nanmedian(values))
+            least = (largest if branch is None else branch.best) + self.settings.worth * excess
             best = float(learned.standardised(np.array([least]))[0])
             if branch is None:
                 # Predicted values of pending points count, so that points of one batch do not all improve on one value.
@@ -122,14 +135,14 @@ def _filling(points: Array, rng: np.random.Generator) -> Array:
     return np.asarray(candidates[np.argmax(gaps)])
 
 
-def _branch(points: Array, values: Array) -> _Branch | None:
+def _branch(points: Array, values: Array, worth: float) -> _Branch | None:
     """Return the branch that the search is in after these known values, in their order; None for the whole cube."""
     branch, misses, best, place = None, 0, -np.inf, points[0]
     ordered: list[float] = []
     for count, (point, value) in enumerate(zip(points, values.tolist(), strict=True), start=1):
         insort(ordered, value)
         median = (ordered[(count - 1) // 2] + ordered[count // 2]) / 2
-        margin = _WORTH * max(best, value) - _WORTH * median
+        margin = worth * max(best, value) - worth * median
         improves = value > best + margin
         if value > best:
             best, place = value, point

@@ -31,10 +31,18 @@ from ctxval.searches.base import Costs, Note, Prediction, SequentialSearch, best
 from ctxval.searches.bayesian_optimisation import BayesianOptimisation
 
 _ENGINE = "climb"  # the name of this search in notes of existing stores, so it differs from that of the class
-POINTS = 400  # largest number of points that are predicted for one suggestion, for each dimension
-_IMPROVEMENT = 1e-3  # least predicted improvement worth an execution, as a share of the largest value
-_COMPARED_FROM = 6  # number of known values from which on the prediction must be better than the surrogate
-_COMPARED_ON = 24  # largest number of known values, the latest ones, on which the two are compared
+
+
+@dataclass(frozen=True)
+class TrustRegionSettings:
+    """How many points are predicted for a choice, and when a prediction or an execution is worth it."""
+
+    points: int = 400  # largest number of points that are predicted for one suggestion, for each dimension
+    # shares of it that are predicted for a choice, from thorough to fast
+    shares: tuple[float, ...] = (1.0, 0.4, 0.15)
+    improvement: float = 1e-3  # least predicted improvement worth an execution, as a share of the largest value
+    compared_from: int = 6  # number of known values from which on the prediction must be better than the surrogate
+    compared_on: int = 24  # largest number of known values, the latest ones, on which the two are compared
 
 
 class _Candidate(NamedTuple):
@@ -76,6 +84,7 @@ class TrustRegion(SequentialSearch):
 
     initial = 1
 
+    settings = TrustRegionSettings()
     # What is set otherwise to study the parts of the search (benchmarks/study_ablations.py).
     compare_with_surrogate = True  # whether a prediction is used only if leave-one-out errors show that it is good
     restrict = True  # whether there are trust regions; if not, the whole cube is searched each time
@@ -121,9 +130,9 @@ class TrustRegion(SequentialSearch):
 
     def _why_not(self, prediction: Prediction, surrogate_error: Callable[[], float]) -> str | None:
         known = np.flatnonzero(np.isfinite(self.values))
-        if not self.compare_with_surrogate or len(known) < _COMPARED_FROM:
+        if not self.compare_with_surrogate or len(known) < self.settings.compared_from:
             return None
-        latest = known[-_COMPARED_ON:]
+        latest = known[-self.settings.compared_on :]
         error = _log_error(prediction.left_out(self.points[latest]), self.values[latest])
         if error <= 0.1 or error <= surrogate_error():  # a small error needs no comparison
             return None
@@ -136,7 +145,7 @@ class TrustRegion(SequentialSearch):
         kept = kept_rows(points, values, 150, long=150)  # they end with the latest values, which are compared
         surrogate = fit_surrogate(points[kept], values[kept])
         left_out = surrogate.shift + surrogate.scale * surrogate.process.left_out()[0]
-        latest = slice(-min(len(values), _COMPARED_ON), None)
+        latest = slice(-min(len(values), self.settings.compared_on), None)
         return _log_error(left_out[latest], values[latest])
 
     def _why_hedge(self) -> str | None:
@@ -150,7 +159,7 @@ class TrustRegion(SequentialSearch):
         if len(last) == 2 and (self._last_note or {})["doubt"] > 1 and error > 0.5:
             return f"the last two predictions erred by {100 * error:.0f} % or more and the next one is in doubt"
         values = values[np.isfinite(values)]
-        gains = values[1:] > (1 + _IMPROVEMENT) * np.maximum.accumulate(values)[:-1]
+        gains = values[1:] > (1 + self.settings.improvement) * np.maximum.accumulate(values)[:-1]
         fruitless = len(gains) - int(np.flatnonzero(gains).max(initial=-1)) - 1
         return f"the last {fruitless} executions found nothing larger" if fruitless >= 6 else None
 
@@ -189,7 +198,7 @@ class TrustRegion(SequentialSearch):
             best = self._best(prediction, self.optimism, region, history, rng)
             if best is not None:
                 # It may exceed the region's best value and, with ten times the optimism, the largest value of all.
-                least, largest = 1 + _IMPROVEMENT, float(np.nanmax(history.values, initial=0.0))
+                least, largest = 1 + self.settings.improvement, float(np.nanmax(history.values, initial=0.0))
                 kappas = self.optimism, 10.0 * self.optimism
                 optimistic, patient = (best.expected * (1 + kappa * best.doubt) for kappa in kappas)
                 if optimistic > region.best * least and patient > largest * least:
@@ -216,7 +225,7 @@ class TrustRegion(SequentialSearch):
             order = np.argsort(-np.nan_to_num(predicted, nan=-np.inf), kind="stable")
             points, predicted = points[order], predicted[order]
         else:
-            budget = min(prediction.budget, POINTS * self.dimension)
+            budget = min(prediction.budget, self.settings.points * self.dimension)
             rough = None if prediction.rough is None else functools.partial(optimistic, prediction.rough)
             starts = best_first(history.points, history.values)[:8]
             points, predicted = ascend(value, box, budget, starts, rng, rough)
@@ -241,7 +250,7 @@ class TrustRegion(SequentialSearch):
                     region = _Region(note["climb"], note["radius"], stale=region.stale + 1)
                 if not np.isfinite(value):
                     region = replace(region, misses=region.misses + 1)
-                elif value > region.best * (1 + _IMPROVEMENT) or region.point is None:
+                elif value > region.best * (1 + self.settings.improvement) or region.point is None:
                     grown = region.radius if region.point is None else min(1.0, 2 * region.radius)
                     region = replace(region, best=value, point=point, misses=0, radius=grown)
                 else:
@@ -252,7 +261,7 @@ class TrustRegion(SequentialSearch):
                     region = replace(region, misses=region.misses + 1, radius=radius)
             elif value > region.best:
                 region = replace(region, best=value, point=point)
-            if value > largest * (1 + _IMPROVEMENT) or largest == -np.inf:
+            if value > largest * (1 + self.settings.improvement) or largest == -np.inf:
                 region = replace(region, stale=0)
             largest = max(largest, value) if np.isfinite(value) else largest
         return region
@@ -268,8 +277,6 @@ def _log_error(expected: Array, values: Array) -> float:
 
 Thinking = Literal["balanced", "fast", "thorough"]
 
-FAST = 0.15  #: share of the largest number of points that fast thinking predicts
-_SHARES = (1.0, 0.4, FAST)  # of the largest number of points that are predicted for a choice, from thorough to fast
 DESIGNS = "designs"  #: key in a note: the number of points that are predicted for each choice of the campaign
 
 
@@ -299,7 +306,7 @@ class Auto(TrustRegion):
         if prediction is not None:
             prediction = replace(prediction, budget=self.designs(prediction))
             known = int(np.isfinite(self.values).sum())  # of which some are predicted, too, for a comparison
-            compared = min(known, _COMPARED_ON) if known >= _COMPARED_FROM else 0
+            compared = min(known, self.settings.compared_on) if known >= self.settings.compared_from else 0
             usual = usual_effort(self.dimension, prediction.budget)
             expect(usual.exact + usual.rough + compared)
         super().use_prediction(prediction)
@@ -313,12 +320,12 @@ class Auto(TrustRegion):
 
     def designs(self, prediction: Prediction) -> int:
         """Return the number of points that are predicted for the next choice."""
-        most = min(prediction.budget, POINTS * self.dimension)
+        most = min(prediction.budget, self.settings.points * self.dimension)
         match self.thinking:
             case "thorough":
                 return most
             case "fast":
-                return max(1, round(FAST * most))
+                return max(1, round(self.settings.shares[-1] * most))
             case number if number != "balanced":
                 return min(int(number), most)
         # The number is fixed once an execution was timed; the note of that choice has it.
@@ -330,7 +337,7 @@ class Auto(TrustRegion):
         # supposed to take 10 s.
         costs = prediction.costs()
         seconds = max(1.0, 10.0 if costs.evaluation is None else costs.evaluation)
-        numbers = [max(1, round(share * most)) for share in _SHARES]
+        numbers = [max(1, round(share * most)) for share in self.settings.shares]
         designs = next((number for number in numbers if self.thinking_seconds(costs, number) <= seconds), numbers[-1])
         self._fixed_now = None if costs.evaluation is None else designs
         return designs
