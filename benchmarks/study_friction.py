@@ -73,8 +73,9 @@ inputs of M. A second one took the friction of a joint at rest for that of the s
 written it then made 22 systems to mislead it, of seals, guides, gears, brakes and bristles, and at 0.95 d* 25 of 31
 campaigns were validated falsely, on 16 of these systems. The present version bounds the friction at rest, in each
 direction, by what joints withstood and what set them in motion. It was developed on five of the 16 (breakaway, lugre,
-xy-breakaway, breakaway-final, seal-lip), and of all these campaigns, those are still validated falsely whose friction
-at rest is larger at one place, which the verdict says that it rests on. How tasks are chosen with it was developed on
+xy-breakaway, breakaway-final, seal-lip), and of all these campaigns, those were still validated falsely whose friction
+at rest is larger at one place. Now [such places are looked for](theory.md#dry-friction), as far as the figures of
+[reliability](reliability.md#rare-evidence) show. How tasks are chosen with it was developed on
 cylinder, rotary-seal, sealed-table and xy-table. Lip-seal, sealed-gantry and sealed-lift were written after it, and
 not tuned on.)
 

@@ -117,8 +117,8 @@ class RestPlaces:
         """A place in this stretch from which fewest departures fill it, and a force that tests the place."""
         place, most = float(self.needed.places[self.widest[1]]), REST_GAP * self.width
         tested = self.left.places[self.left.forces <= self.allowed]
-        ends = np.append(tested, [self.needed.places.min(), self.needed.places.max()])
-        low, high = ends[ends <= place].max(), ends[ends >= place].min()
+        low = tested[tested <= place].max(initial=self.needed.places.min())
+        high = tested[tested >= place].min(initial=self.needed.places.max())
         place = float(low + (high - low) / max(np.ceil((high - low) / (SETTINGS.filled * most)), 2))
         # Where a force did not move the joint, a larger one may.
         withstood = self.held.forces[np.abs(self.held.places - place) <= 0.5 * most].max(initial=0.0)
