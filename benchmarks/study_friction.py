@@ -109,7 +109,8 @@ def write_page(page: Path = PAGE) -> None:
     def validated(of: list[dict[str, Any]]) -> list[dict[str, Any]]:
         return [line for line in of if line["answer"] == "validated"]
 
-    for system in SYSTEMS:
+    systems = [system for system in SYSTEMS if any(STORED.select(system=system))]
+    for system in systems:
         cells = [system]
         for looked_for in (True, False):
             of = lines(1.25, looked_for, system)
@@ -133,7 +134,7 @@ def write_page(page: Path = PAGE) -> None:
     page.write_text(
         TEXT.format(
             budget=BUDGET,
-            count=len(SYSTEMS),
+            count=len(systems),
             tasks=TASKS,
             found=counted(True, REGULAR),
             before=counted(False, REGULAR),

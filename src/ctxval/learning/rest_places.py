@@ -36,7 +36,7 @@ class RestSettings:
     harder: float = 1.3  # by how much the force of a task exceeds the one that the joint withstood there
     mostly: tuple[float, float] = (1e-3, 1 - 1e-3)  # quantiles of the needed places that are their range
     first: float = 2.0  # largest multiple of what motion shows that a task has which also bounds friction at rest
-    slow: float = 0.05  # rate up to which a joint may be at rest, as a share of its root mean square
+    moves_off: float = 0.02  # share of the largest rate of a slow joint at which one may have left rest
     moves: tuple[float, ...] = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005)  # steps of a search for tasks, as shares of the cube
     tried: int = 48  # tasks in each of these steps
     kept: int = 8  # the best tasks, from which the next step begins
@@ -218,11 +218,12 @@ def predicted_departures(
     friction = posterior.covariances.model
     assert isinstance(friction, DryFriction)
     rate, found = int(friction.rates[joint]), list[tuple[Array, Array, Rows]]()
+    slow = friction.still[joint] / friction.settings.held
     for plan, each in zip(planned, loops, strict=True):
         x, u = each.states[0], each.inputs[0, ..., : posterior.data.inputs]
         before, after = x[:, :-1, rate], x[:, 1:, rate]
-        slow = SETTINGS.slow * np.sqrt(np.nanmean(np.where(np.isfinite(x[..., rate]), x[..., rate], 0.0) ** 2))
-        may = (np.abs(before) <= slow) & (np.abs(after) > friction.still[joint]) | (before * after < 0)
+        may = (np.abs(before) <= slow) & (np.abs(after) > np.abs(before)) & (np.abs(after) > SETTINGS.moves_off * slow)
+        may |= before * after < 0
         task, step = np.nonzero(may & np.isfinite(x).all(axis=2)[:, 1:])
         if len(task):
             some = Transitions(x[task, step], u[task, step], x[task, step + 1])
