@@ -5,70 +5,61 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from ctxval.paper.reproduce.jobs import AUTO, measured_with
+from page_tables import GeneratedPage, reflowed, table
 from study_compare import BUDGETS, CONFIDENCE, PAPER, PLAIN, STORED
 
-PAGE = Path(__file__).parents[1] / "docs" / "comparison.md"
-
-INTRODUCTION = f"""\
-# Comparisons: executions and false decisions
+TEXT = """# Comparisons: executions and false decisions
 
 `make compare-study` computes these tables, and `ctxval compare` is the command. All decisions of one comparison hold
-together with confidence {CONFIDENCE}. The truths come from dense grids, which a real system would not have.
-{measured_with(STORED.values(), AUTO)}
+together with confidence {confidence}. The truths come from dense grids. {measured}
 
 ## The paper's arm: network, Gaussian process, linear model
 
-The paper compares three models of its robotic arm by d*, and by the distance at which the system ends from its target.
-It executes {PAPER} tasks for each model, so three separate campaigns take {3 * PAPER}. A comparison may take half of
-that. Here the first question is `worst` with the paper's distance, and the second one is `mean` with the final distance
-of the system from its target. Each seed draws other data for the models.
-"""
+The paper compares three models of its arm by d*, and by the distance at which the system ends from its target, with
+{paper} executions for each model: {separate} in three separate campaigns. The question `worst` has the paper's
+distance, and `mean` the final distance of the system from its target. Each seed draws other data for the models.
 
-SKEWED = """
-## Skewed differences
+{arm}
 
-Without a largest possible distance, the decisions on expected distances are exact only if the corrected differences of
-the two candidates are symmetric about their mean, and asymptotic otherwise. If the differences are skewed, decisions
-are false more often than stated. The table is for independent draws with the mean 0, so every decision on the sign is
-false; at most 5 % should be. State `--largest-possible` if a number is known that no distance can exceed: the
-decisions are then valid for every distribution.
-"""
-
-CART = """
 ## Two controllers on carts
 
 Each seed draws the drag of a cart and the weights of two LQRs. A decision is false if the other candidate has the
-smaller true value. No largest possible distance is stated, so the decisions on expected distances are the asymptotic
-ones. The last column counts the confidence intervals that do not contain the true difference at the end. Here one
-controller is usually better in most tasks, so false decisions are rarer than intervals without the truth.
+smaller true value. No largest possible distance is stated, so decisions on expected distances are asymptotic. The
+last column counts confidence intervals without the true difference. One controller is usually better in most tasks,
+so false decisions are rarer than these.
+
+{carts}
+
+## Skewed differences
+
+Without a largest possible distance, decisions on expected distances are exact only if the corrected differences are
+symmetric about their mean. Here independent draws have the mean 0, so every decision on the sign is false; at most 5
+% should be. State `--largest-possible` if no distance can exceed a known number: the decisions are then valid for
+every distribution.
+
+{skewed}
 """
 
 _NAMES = {"worst": "worst", "mean": "mean", "plain": "mean, without predictions"}
+_ARM = ["question", "seed", "executions", f"share of {3 * PAPER}", "pairs decided", "false", "ranking", "truths [mm]"]
+_CARTS = ["question", "comparisons", "budget", "decided", "false", "executions: median, largest"]
 
 
-def page() -> str:
+def page() -> GeneratedPage:
     """Return the whole page."""
-    arm = [row for question in ("worst", "mean") for row in _arm_rows(question)]
-    carts = [row for question in _NAMES for row in _cart_rows(question)]
-    share = f"share of {3 * PAPER}"
-    heads = ("question", "seed", "executions", share, "pairs decided", "false", "ranking", "truths [mm]")
-    cart_heads = (
-        "question",
-        "comparisons",
-        "budget",
-        "decided",
-        "false",
-        "executions: median, largest",
-        "intervals without the truth",
+    text = TEXT.format(
+        confidence=CONFIDENCE,
+        measured=measured_with(STORED.values(), AUTO),
+        paper=PAPER,
+        separate=3 * PAPER,
+        arm=table(_ARM, [row for question in ("worst", "mean") for row in _arm_rows(question)]),
+        carts=table([*_CARTS, "intervals without the truth"], [row for one in _NAMES for row in _cart_rows(one)]),
+        skewed=table(["distribution of the differences", "draws", "repetitions", "false"], _skewed_rows()),
     )
-    skewed_heads = ("distribution of the differences", "draws", "repetitions", "false")
-    measured = [INTRODUCTION, _table(heads, arm), CART, _table(cart_heads, carts)]
-    return "\n".join([*measured, SKEWED, _table(skewed_heads, _skewed_rows()), ""])
+    return GeneratedPage("comparison.md", reflowed(text))
 
 
 def _arm_rows(question: str) -> list[tuple[str, ...]]:
@@ -128,9 +119,5 @@ def _share(count: int, whole: int) -> str:
     return f"{count} ({100 * count / whole:.1f} %)"
 
 
-def _table(headers: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (headers, ["---"] * len(headers), *rows))
-
-
 if __name__ == "__main__":
-    PAGE.write_text(page())
+    page().write()

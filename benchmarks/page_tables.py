@@ -57,7 +57,7 @@ def reflowed(text: str) -> str:
 
 
 def _is_kept(block: str) -> bool:
-    return not block.strip() or block.lstrip("\n")[0] in "|#!`<$"
+    return not block.strip() or block.lstrip("\n").startswith(("|", "#", "![", "```", "<", "$$"))
 
 
 def _filled(block: str) -> str:

@@ -5,10 +5,7 @@
 
 from __future__ import annotations
 
-import re
-import textwrap
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -17,8 +14,8 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+from page_tables import DOCS, GeneratedPage, Table, reflowed, table
 from study_servo import (
-    COMPARED_STORED,
     DISTANCES,
     FITTED,
     MODELS,
@@ -32,22 +29,17 @@ from study_servo import (
     validation,
 )
 
-DOCS = Path(__file__).parents[1] / "docs"
 NAMES = [f"{path}-{gain}" for gain in servo.GAINS for path in servo.PATHS]
 
-PAGE = """\
-# On a real servo
+TEXT = """# On a real servo
 
-`make servo` computes this page. A Dynamixel XL330 servo turns a pendulum of 0.49 kg. The Rhoban team has recorded
-it in 16 closed loops, four references at four gains of the servo's firmware, and has published them with friction
-models of the servo ([source and licence](https://github.com/Rhoban/bam), Apache-2.0; Duclusaud, Passault and
-others, *Extended Friction Models for the Physics Simulation of Servo Actuators*, arXiv 2410.08650). The recordings
-are no part of ctxval. They are the 16 files with a mass of 0.49 kg at a length of 0.1 m in the folder
-`bam/data.bak/processed` of that repository at commit af22604, and FOLDER below is a folder with these files. The
-pictures and numbers of this page are made from them. The system was built by others, and has the limits of real
-recordings:
-only the angle is recorded, by an encoder with 4096 counts per turn; the torque is switched off in some runs; and
-there are 16 runs and no more.
+`make servo` computes this page. A Dynamixel XL330 servo turns a pendulum of 0.49 kg. The Rhoban team recorded it in
+16 closed loops, four references at four gains of the servo's firmware, and published the recordings with friction
+models ([source and licence](https://github.com/Rhoban/bam), Apache-2.0; Duclusaud, Passault and others, *Extended
+Friction Models for the Physics Simulation of Servo Actuators*, arXiv 2410.08650). The recordings are no part of
+ctxval: FOLDER is a folder with the 16 files of 0.49 kg at 0.1 m in `bam/data.bak/processed` of that repository at
+commit af22604. They have the limits of real recordings: an encoder with 4096 counts per turn records the angle
+alone, the torque is switched off in some runs, and there are 16 runs and no more.
 
 ```console
 $ cd examples/servo
@@ -56,94 +48,79 @@ $ ctxval run servo:experiment --option folder=FOLDER --threshold 0.6 --option fr
 ```
 
 The tasks are a [suite](how-to/suites.md), and `systems.Recorded` gives the recording of a task when it is chosen.
-The controller is the firmware: a duty in proportion to the error of the encoder's angle, with its limit. It runs on
-the model in the same way. The model has an angle and a rate, and the validation has `outputs=[0]`. The distance is
-the largest deviation of the angle between the model and the servo over 6 s.
+The controller is the firmware: a duty in proportion to the error of the encoder's angle, with its limit; it runs on
+the model in the same way. The validation has `outputs=[0]`. The distance is the largest deviation of the angle over
+6 s.
 
 ## The models
 
-m1 has viscous and Coulomb friction. In m3, friction also depends on the torque that the gears carry, and in m4 this
-part has a Stribeck term. Their parameters are those that were published. In the other columns they are fitted to
-the angles of two of the 16 recordings, in three pairs that were chosen before the first fit.
+m1 has viscous and Coulomb friction. In m3, friction also depends on the torque that the gears carry; in m4 this part
+has a Stribeck term. Parameters are as published, or fitted to the angles of two recordings, in three pairs that were
+chosen before the first fit.
 
 {models}
 
-**The published m4 is better than m1 at gains up to 200, and not where it matters**: its d* is {m4:.2f} rad and that
-of m1 is {m1:.2f} rad. Fitted to two recordings, m4 has a d* of {fitted}, and m1 of {fitted_m1}: with a friction
-that does not depend on the load, no fit helps in all runs.
+**The published m4 is better than m1 at gains up to 200, and not at the largest distances**: its d* is {m4:.2f} rad
+and that of m1 is {m1:.2f} rad. Fitted to two recordings, m4 has a d* of {fitted}, and m1 of {fitted_m1}: with a
+friction that does not depend on the load, no fit helps in all runs. [All runs](tables/servo-runs.csv).
 
 ![The angle of the servo and of the models m1 and m4 in four runs, with the reference](pictures/servo.png)
 
-*The servo sticks where the reference turns round, at up to 1.2 rad and against the weight of the pendulum, and the
-models follow. The tasks with the largest distances at gains of 400 and 800 are of this kind (sin_sin, up_and_down),
-are swings after the torque is switched off, which the models damp too little (lift_and_drop), or are at the end of
-the fast sweep, where the servo is later than the models (sin_time_square).*
+*The servo sticks where the reference turns round, against the weight of the pendulum, and the models follow the
+reference (sin_sin, up_and_down). The models damp swings without torque too little (lift_and_drop), and the servo is
+later than the models at the end of the fast sweep (sin_time_square).*
 
-The largest deviations [rad] and, after the slash, the RMS deviations [rad] of all runs:
+## Campaigns, one run at a time
 
-{runs}
-
-## What a campaign finds, one run at a time
-
-A campaign sees a recording when it executes its task, and the others judge it. {campaigns} campaigns were run until
-they were decided, at thresholds of 1.1 and 0.9 times the largest distance of all 16.
+A campaign sees a recording when it executes its task. {campaigns} campaigns ran until they were decided, at
+thresholds of 1.1 and 0.9 times the largest distance of all 16 runs.
 
 {searches}
 
-**Each verdict is true.** {validated} What is in the way is dry friction. Where the servo sticks, its rate jumps to
-0, and that is no smooth function of angle, rate and duty; so the learned dynamics predict other runs only roughly,
-and the campaign says so and goes on. Of {predictions} predictions that were stored before their run, {near} came
-within 20 % of the threshold of what was executed, and the median error is {error:.0f} % of the threshold. At 0.9
-d*, the first run above the threshold decides.
+Numbers are medians with the smallest and the largest. A random order meets the worst of 16 runs after 8.5.
 
-## Which model is better
-
-`ctxval.compare` asks which model has the smaller d*. The firmware's inputs follow from the recorded angle alone, so
-one run counts for all models.
-
-{comparisons}
+**Each verdict is true.** {validated} The cause is dry friction: where the servo sticks, its rate jumps to 0, which
+is no smooth function of angle, rate and duty. So the learned dynamics predict other runs roughly: of {predictions}
+predictions that were stored before their run, {near} came within 20 % of the threshold, and the median error is
+{error:.0f} % of it.
 
 ## Refined with eight runs
 
-`ctxval.refine` estimates the rate along each run from the recorded angle, and learns a correction of the model from
-what one step misses. Here it learns from eight runs, in which each reference has two gains, and the other eight judge
-the model that it has learned; then the halves change places. The threshold is 0.9 times the largest distance of the
-eight runs that it learns from.
+`ctxval.refine` learns a correction of the model from eight runs, in which each reference has two gains; the other
+eight judge it, and then the halves change places. The threshold is 0.9 times the largest distance of the eight runs
+that it learns from.
 
 {refined}
 
-## What is not shown
+## Limits of this study
 
-- Two executions of one task were not recorded, so it is not known how much of a distance is chance. The verdicts
-  are   about the recorded runs.
-- The recordings were interpolated to steps of 5 ms by those who published them; here a step takes 10 ms, and the
-  duty is   held for that time. The firmware is faster.
-- `ctxval replay` refuses a validation with outputs.
+- No task was recorded twice, so it is not known how much of a distance is chance. The verdicts are about recorded
+  runs.
+- The recordings were interpolated to steps of 5 ms when they were published; here a step takes 10 ms, and the duty
+  is held for that time. The firmware is faster.
 """
 
 
-def page() -> str:
-    """Return the whole page."""
+def page() -> GeneratedPage:
+    """Return the page and its table."""
     largest = {model: max(pair[0] for pair in DISTANCES[model,]["distances"].values()) for model in (*MODELS, *FITTED)}
     errors = [error for line in STORED.values() for error in _errors(line)]
     _require_claims(largest)
-    text = PAGE.format(
+    text = TEXT.format(
         models=_models(largest),
         m1=largest["m1"],
         m4=largest["m4"],
         fitted=_listed([largest[f"m4 {pair}"] for pair in PAIRS]),
         fitted_m1=_listed([largest[f"m1 {pair}"] for pair in PAIRS]),
-        runs=_runs(),
         campaigns=len(STORED),
         searches=_searches(),
         validated=_validated(),
         predictions=len(errors),
         near=sum(error <= 0.2 for error in errors),
         error=100 * float(np.median(errors)),
-        comparisons=_comparisons(),
         refined=_refined(),
     )
-    return "\n\n".join(map(_wrapped, text.strip().split("\n\n"))) + "\n"
+    return GeneratedPage("servo.md", reflowed(text), {"servo-runs": _runs()})
 
 
 def _require_claims(largest: dict[str, float]) -> None:
@@ -156,23 +133,9 @@ def _require_claims(largest: dict[str, float]) -> None:
     assert max(largest[f"m1 {pair}"] for pair in PAIRS) > largest["m1"]
 
 
-def _wrapped(block: str) -> str:
-    """Return a paragraph or a list in lines of at most 116 characters."""
-    if block.startswith(("```", "|", "#", "![")):
-        return block
-    if block.startswith("- "):
-        items = re.split(r"\n(?=- )", block)
-        return "\n".join(textwrap.fill(" ".join(item.split()), 116, subsequent_indent="  ") for item in items)
-    return textwrap.fill(" ".join(block.split()), 116)
-
-
 def _listed(values: Sequence[float]) -> str:
     *first, last = (f"{value:.2f}" for value in values)
     return f"{', '.join(first)} and {last} rad"
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
 
 
 def _models(largest: dict[str, float]) -> str:
@@ -181,14 +144,14 @@ def _models(largest: dict[str, float]) -> str:
         [model, f"{largest[model]:.3f}", *(f"{largest.get(f'{model} {pair}', np.nan):.3f}" for pair in PAIRS)]
         for model in MODELS
     ]
-    return _table(head, rows).replace("nan", "")
+    return table(head, rows).replace("nan", "")
 
 
-def _runs() -> str:
-    head = ["run", *(_short(model) for model in SHOWN)]
+def _runs() -> Table:
+    """Return the largest and the RMS deviations of all runs."""
     known = {model: DISTANCES[model,]["distances"] for model in SHOWN}
-    rows = [[name, *(" / ".join(f"{value:.3f}" for value in known[model][name]) for model in SHOWN)] for name in NAMES]
-    return _table(head, rows)
+    head = ["run", *(f"{_short(model)}: {kind} [rad]" for model in SHOWN for kind in ("largest", "RMS"))]
+    return head, [[name, *(f"{value:.3f}" for model in SHOWN for value in known[model][name])] for name in NAMES]
 
 
 def _short(model: str) -> str:
@@ -214,10 +177,7 @@ def _searches() -> str:
                 met = sum(max(line["distances"]) >= largest - 1e-9 for line in lines)
                 worst = f"{_spread(found)} runs" if met == len(lines) else f"in {met} of {len(lines)}"
             rows.append([model, f"{share} d*", str(len(lines)), counts, _spread(executed), worst])
-    medians = (
-        "Numbers are medians with the smallest and the largest. A random order meets the worst of 16 after 8.5 runs."
-    )
-    return f"{_table(head, rows)}\n\n{medians}"
+    return table(head, rows)
 
 
 def _validated() -> str:
@@ -243,22 +203,6 @@ def _errors(line: dict[str, Any]) -> list[float]:
     return [abs(predicted - distance) / threshold for predicted, distance in pairs if predicted is not None]
 
 
-def _comparisons() -> str:
-    if not COMPARED_STORED:
-        return "No comparison is stored."
-    head = ["models", "smaller d*", "runs", "why"]
-    rows = []
-    for line in COMPARED_STORED.values():
-        first, second = line["models"].split(" / ")
-        smaller = line["smaller"]
-        if smaller is not None:  # the page must not show a false decision without saying so
-            largest = {one: max(pair[0] for pair in DISTANCES[one,]["distances"].values()) for one in (first, second)}
-            assert largest[smaller] == min(largest.values())
-        reason = line["reason"].replace(second, _short(second)).split("; decided after")[0]
-        rows.append([f"{_short(first)}; {_short(second)}", _short(smaller or "-"), str(line["executions"]), reason])
-    return f"{_table(head, rows)}"
-
-
 def _refined() -> str:
     head = ["model", "half", "largest of the others [rad]", "mean of the others [rad]", "nearer runs", "result"]
     rows, refused = [], 0
@@ -275,11 +219,10 @@ def _refined() -> str:
             refused += 1
     text = (
         f"In {len(rows) - refused} of {len(rows)} cases the refined model is nearer to runs that it has not seen. In "
-        f"{refused} there is no model: what was learned is farther than the threshold from a run that it was learned "
-        "from. The errors of the encoder are in each estimated rate, so one step says little of friction, and eight "
-        "runs do not suffice in each case."
+        f"{refused} there is no model, because a run that it was learned from stays above the threshold. Each "
+        "estimated rate has the errors of the encoder, so one step says little of friction."
     )
-    return f"{_table(head, rows)}\n\n{text}"
+    return f"{table(head, rows)}\n\n{text}"
 
 
 def draw() -> None:
@@ -307,4 +250,4 @@ def draw() -> None:
 if __name__ == "__main__":
     require_recordings()
     draw()
-    (DOCS / "servo.md").write_text(page())
+    page().write()

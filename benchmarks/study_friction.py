@@ -11,7 +11,6 @@ import argparse
 import functools
 import time
 import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,10 +19,10 @@ from ctxval import Campaign
 from ctxval._util.json_lines import JsonLines
 from ctxval.learning.dynamics_study import DynamicsStudy
 from friction_systems import AT_REST, DEVELOPED_AT_REST, DEVELOPMENT, REGULAR, SYSTEMS
+from page_tables import GeneratedPage, reflowed, table
 from study_auto import RESULTS
 
 STORED = JsonLines(RESULTS / "friction.jsonl", ("system", "share", "seed", "looked_for"))
-PAGE = Path(__file__).parents[1] / "docs" / "dry-friction.md"
 BUDGET, TASKS = 25, 4000
 
 
@@ -61,44 +60,45 @@ def study(system: str, share: float, seed: int, looked_for: bool) -> dict[str, A
 
 TEXT = """# Dry friction, measured
 
-`make friction` makes this page. M lacks dry friction, which stops a joint short of its goal: the residual jumps where
-the joint stops or turns, and is no smooth function of state and input. From four executions on, friction is looked
-for at each input. It may grow with the input and be larger at rest, and is used if it halves the errors of the rates
-of left-out executions, apart from noise ([what is computed](theory.md#dry-friction)). Campaigns of at most {budget}
-executions ran on {count} systems. The method was developed on four of them: a geared pendulum, a ball screw whose
-friction is larger at rest, an axis whose friction grows with the force, and an arm of MuJoCo with `frictionloss`.
-Nothing was tuned on the others. d* is the largest distance over {tasks:,} random tasks. (A first version, of which
-campaigns on cart-pole, gantry, scara and worn-guide were seen, took friction for constant, and estimated it in the
-inputs of M. A second one took the friction of a joint at rest for that of the slowest motion. Somebody who had not
-written it then made 22 systems to mislead it, of seals, guides, gears, brakes and bristles, and at 0.95 d* 25 of 31
-campaigns were validated falsely, on 16 of these systems. The present version bounds the friction at rest, in each
-direction, by what joints withstood and what set them in motion. It was developed on five of the 16 (breakaway, lugre,
-xy-breakaway, breakaway-final, seal-lip), and of all these campaigns, those were still validated falsely whose friction
-at rest is larger at one place. Now [such places are looked for](theory.md#dry-friction), as far as the figures of
-[reliability](reliability.md#rare-evidence) show. How tasks are chosen with it was developed on
-cylinder, rotary-seal, sealed-table and xy-table. Lip-seal, sealed-gantry and sealed-lift were written after it, and
-not tuned on.)
+`make friction` makes this page. M lacks dry friction, which stops a joint short of its goal: the residual jumps
+where the joint stops or turns, and is no smooth function of state and input. So friction is looked for at each input
+([method](theory.md#dry-friction)). Campaigns of at most {budget} executions ran on {count} systems; d* is the
+largest distance of {tasks:,} random tasks.
 
-**At 1.25 d\\*, {found} campaigns on the other systems with friction of a kind that is learned were validated; without
-looking for friction, {before}. With seals, {sealed} were, {sealed_developed} on those that the choice of tasks was
-developed on, and on the systems of the development {developed}, and {developed_before} without looking. At
-0.95 d\\*, {false} of {below} campaigns on all systems were validated, which is false.**
+| systems | 1.25 d*: validated | without looking for friction |
+| --- | --- | --- |
+| not tuned on, with friction of a kind that is learned | {found} | {before} |
+| not tuned on, with seals | {sealed} | - |
+| on which the choice of tasks was developed | {sealed_developed} | - |
+| on which the method was developed | {developed} | {developed_before} |
 
-{table}
+**At 0.95 d*, {false} of {below} campaigns on all systems were validated, which is false.**
 
-"Friction" is the median of what was found at each input, in its units; "CPU" the median of seconds, of the
-campaigns at 1.25 d\\*. Friction that is larger in one direction (two-way-ratchet) is friction of constant size and
-a constant push. Friction that changes with the place (worn-guide) is beyond the method.
+{short}
+
+"Friction" is the median of what was found at each input, in its units. Friction that is larger in one direction
+(two-way-ratchet) is friction of constant size and a constant push. Friction that changes with the place (worn-guide)
+is beyond the method. [CPU times and campaigns without friction](tables/dry-friction.csv).
+
+## How the method was chosen
+
+It was developed on a geared pendulum, a ball screw, an axis whose friction grows with the force, and an arm of
+MuJoCo; the choice of tasks, on cylinder, rotary-seal, sealed-table and xy-table. A first version took friction for
+constant, and a second one took the friction of a joint at rest for that of the slowest motion. An independent set of
+22 systems was made to mislead the second one, with seals, guides, gears, brakes and bristles: at 0.95 d*, 25 of 31
+campaigns were validated falsely. The present version bounds friction at rest by the forces that joints withstood and
+that set them in motion; it was developed on five of these 22. Of these campaigns, those were still validated falsely
+whose friction at rest is larger at one place. [Places of rest](theory.md#dry-friction) have been tested since
+([figures](reliability.md#rare-evidence)); the campaigns of this page are older. Lip-seal, sealed-gantry and
+sealed-lift were written afterwards.
 """
 
+HEADER = ["system", "1.25 d*: validated", "executions", "CPU s", "friction"]
+HEADER += ["without looking: validated", "executions", "CPU s", "0.95 d*: validated, falsified, undecided"]
 
-def write_page(page: Path = PAGE) -> None:
-    """Write the page of the stored results."""
-    table = [
-        "| system | at 1.25 d\\*: validated | executions | CPU s | friction | without looking: validated | executions "
-        "| CPU s | at 0.95 d\\*: validated, falsified, undecided |",
-        "|---" * 9 + "|",
-    ]
+
+def page() -> GeneratedPage:
+    """Return the page of the stored results and its table."""
 
     def lines(share: float, looked_for: bool, *names: str) -> list[dict[str, Any]]:
         return [line for name in names for line in STORED.select(system=name, share=share, looked_for=looked_for)]
@@ -109,8 +109,10 @@ def write_page(page: Path = PAGE) -> None:
     def validated(of: list[dict[str, Any]]) -> list[dict[str, Any]]:
         return [line for line in of if line["answer"] == "validated"]
 
-    systems = [system for system in SYSTEMS if any(STORED.select(system=system))]
-    for system in systems:
+    rows = []
+    for system in SYSTEMS:
+        if not STORED.select(system=system):
+            continue
         cells = [system]
         for looked_for in (True, False):
             of = lines(1.25, looked_for, system)
@@ -122,31 +124,30 @@ def write_page(page: Path = PAGE) -> None:
                 cells.append(", ".join(f"{label} {np.median(each):.2g}" for label, each in sizes.items()) or "-")
         answers = [line["answer"] for line in lines(0.95, True, system)]
         cells.append(", ".join(str(answers.count(each)) for each in ("validated", "falsified", "undecided")))
-        table.append(f"| {' | '.join(cells)} |")
+        rows.append(cells)
 
     def counted(looked_for: bool, names: tuple[str, ...]) -> str:
-        """Return how many campaigns at 1.25 d* were validated, and after how many executions."""
+        """Return how many campaigns at 1.25 d* were validated, and the median of their executions."""
         of = lines(1.25, looked_for, *names)
-        after = f" (after {median(validated(of), 'executions'):g} executions in the median)" if validated(of) else ""
+        after = f", after {median(validated(of), 'executions'):g} executions" if validated(of) else ""
         return f"{len(validated(of))} of {len(of)}{after}" if of else "not run"
 
     below = lines(0.95, True, *SYSTEMS)
-    page.write_text(
-        TEXT.format(
-            budget=BUDGET,
-            count=len(systems),
-            tasks=TASKS,
-            found=counted(True, REGULAR),
-            before=counted(False, REGULAR),
-            sealed=counted(True, AT_REST),
-            sealed_developed=counted(True, DEVELOPED_AT_REST),
-            developed=counted(True, DEVELOPMENT),
-            developed_before=counted(False, DEVELOPMENT),
-            false=len(validated(below)),
-            below=len(below),
-            table="\n".join(table),
-        )
+    text = TEXT.format(
+        budget=BUDGET,
+        count=len(rows),
+        tasks=TASKS,
+        found=counted(True, REGULAR),
+        before=counted(False, REGULAR),
+        sealed=counted(True, AT_REST),
+        sealed_developed=counted(True, DEVELOPED_AT_REST),
+        developed=counted(True, DEVELOPMENT),
+        developed_before=counted(False, DEVELOPMENT),
+        false=len(validated(below)),
+        below=len(below),
+        short=table([*HEADER[:3], HEADER[4], HEADER[8]], [[*row[:3], row[4], row[8]] for row in rows]),
     )
+    return GeneratedPage("dry-friction.md", reflowed(text), {"dry-friction": (HEADER, rows)})
 
 
 def main() -> None:
@@ -166,7 +167,7 @@ def main() -> None:
                         *(result[key] for key in ("system", "share", "seed", "looked_for", "answer", "executions")),
                         flush=True,
                     )
-    write_page()
+    page().write()
 
 
 if __name__ == "__main__":

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import pytest
 
-from ctxval.paper.reproduce import FULL, STUDIES, table_text
+from ctxval.paper.reproduce import FULL, STUDIES, parameters, table_text
 from ctxval.paper.reproduce.jobs import Results
 
 RESULTS = Path("benchmarks/results/reproduce")
@@ -28,3 +29,5 @@ def test_no_stored_run_is_missing_or_outdated() -> None:
 def test_the_page_is_what_the_stored_runs_give() -> None:
     page = table_text(Path("docs/reproduction"), STUDIES, Results(RESULTS), FULL)
     assert Path("docs/reproduction.md").read_text() == page
+    rows = list(csv.reader(Path("docs/reproduction/parameters.csv").read_text().splitlines()))
+    assert rows == [list(row) for row in parameters(STUDIES)]

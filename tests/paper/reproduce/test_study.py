@@ -77,7 +77,7 @@ def test_a_study_runs_is_drawn_and_enters_the_table_and_a_second_call_reuses_it(
         )
     assert started == [2, 0]
     assert len(done) == 2
-    assert sorted(path.name for path in out.iterdir()) == ["converged-gp.csv", "converged-gp.png"]
+    assert sorted(path.name for path in out.iterdir()) == ["converged-gp.csv", "converged-gp.png", "parameters.csv"]
     assert sorted(path.name for path in stored.iterdir()) == ["profile.jsonl", "search.jsonl"]
     assert (out / "converged-gp.png").stat().st_size > 10_000
     with (out / "converged-gp.csv").open() as file:
@@ -86,7 +86,7 @@ def test_a_study_runs_is_drawn_and_enters_the_table_and_a_second_call_reuses_it(
     text = table.read_text()
     assert f"stored results in `{stored.as_posix()}/`" in text
     assert "95 % band" in text
-    assert "`torque_weight` = 0.0001" in text
+    assert "pendulum,,torque_weight,0.0001" in (out / "parameters.csv").read_text()
     assert "Dubins" not in text
 
 
