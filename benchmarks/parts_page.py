@@ -92,7 +92,7 @@ def _arguments(build: Any, declared: Declaration) -> str:
 
 
 def _argument(name: str, default: Any, declared: Declaration | None = None) -> str:
-    text = f"`{name}`" if default is inspect.Parameter.empty else f"`{name} = {default!r}`"
+    text = f"`{name}`" if default is inspect.Parameter.empty else f"`{name}={default!r}`"
     if declared is not None and name in declared.files:
         return f"{text} (a file)"
     form = {} if declared is None else declared.functions

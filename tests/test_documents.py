@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 import tomllib
 from dataclasses import fields, replace
@@ -46,6 +47,7 @@ from page_blocks import WRITTEN
 from rig_logs import run
 
 ROOT = Path(__file__).parents[1]
+GLOSSARY = ROOT / "docs" / "tables" / "words.csv"
 
 
 def block(document: str, language: str, holding: str) -> str:
@@ -86,6 +88,11 @@ def test_links_lead_somewhere(document: str) -> None:
         assert (path.parent / target).exists(), target
 
 
+def words() -> list[str]:
+    """Return the keys that the glossary explains."""
+    return re.findall(r"`([^`]+)`", GLOSSARY.read_text(encoding="utf-8"))
+
+
 def keys(report: Any) -> set[str]:
     """Return the keys of a report, at every depth."""
     if isinstance(report, list):
@@ -120,7 +127,7 @@ def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
     used = set().union(*(keys(certificate.to_json()) for certificate in certificates))
     used |= keys({PREDICTION: ExecutionPrediction(1, (0.5,), 0.1, (1,), ((0.0,),), ((0.1,),), 0.0).to_json()})
     used |= {*get_args(Origin), *get_args(State), *KINDS, "validated", "falsified", "undecided"}
-    explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
+    explained = words()
     explained += re.findall(r"^\| `([^`]+)` \|", (ROOT / "docs" / "parts.md").read_text(), re.MULTILINE)  # added kinds
     assert used <= set(explained)
 
@@ -139,7 +146,7 @@ def test_the_glossary_explains_what_replay_and_fit_say() -> None:
     learned = replace(learned, fitted=(replace(learned.fitted[0], parameters=(parameter,)),))
     used = keys(report.to_json()) | keys(learned.to_json())
     names = {*recordings.states, *recordings.inputs}
-    explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
+    explained = words()
     assert used - names <= set(explained)
 
 
@@ -152,7 +159,7 @@ def test_the_glossary_explains_what_refine_says() -> None:
         accuracy={"x": (0.1, 0.2)},
         parameters=(FittedParameter("mass", 1.0, 0.9, 1.1),),
     )
-    explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
+    explained = words()
     assert keys(found.to_json()) - {"x", "v", "u", "goal"} <= set(explained)
 
 
@@ -160,14 +167,14 @@ def test_the_glossary_explains_what_a_watch_says() -> None:
     channel = WatchedChannel("rate residuals", (1.0, 1.1, 0.9), 4.0, np.eye(2))
     state = WatchState(0.5, 1e-3, (channel,))
     state = state.after("a.csv", {"rate residuals": Statistic(1.0, np.zeros(2), np.eye(2))})
-    explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
+    explained = words()
     said = {"watch", "skipped", "again", "statistic", "evidence", "ratio", "run", "task"}
     assert keys(state.to_json()) | said <= set(explained)
 
 
 def test_the_glossary_explains_what_is_said_of_safety() -> None:
     said = {field.name for of in (SafetyReport, UnsafeTask, DrawnTasks, Disturbance) for field in fields(of)}
-    explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
+    explained = words()
     assert (said | {"avoid", "reach", "drawn", "store"}) - {"tightened"} <= set(explained)
 
 
@@ -175,13 +182,13 @@ def test_the_glossary_explains_what_why_says() -> None:
     model = make_validation().model
     shifted = make_validation(systems.Simulated(lambda x, u: model.step(x, u + 0.3), vectorized=True), model)
     said = keys(find_causes(Campaign(shifted, search=searches.by_name("random")).run(2), most=1).to_json())
-    explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
+    explained = words()
     assert said - {"goal"} | {"store", "task", "gap", "other"} <= set(explained)
 
 
 def test_the_glossary_is_in_alphabetical_order() -> None:
-    lines = (ROOT / "docs" / "glossary.md").read_text().splitlines()
-    terms = [line.split("|")[1].strip().replace("`", "").lower() for line in lines if line.startswith("| ")][1:]
+    with GLOSSARY.open(encoding="utf-8") as file:
+        terms = [row["word"].replace("`", "").lower() for row in csv.DictReader(file)]
     assert len(terms) > 100
     assert terms == sorted(terms)
 

@@ -65,7 +65,7 @@ class Channel(ShortRepr):
 
     @property
     def longest(self) -> float:
-        """The longest time between two samples without a gap, seconds: 1.5 periods, or usual longer steps."""
+        """The longest time between two samples without a gap, in seconds; 1.5 periods, or usual longer steps."""
         return 1.5 * self.rhythm[1]
 
 
