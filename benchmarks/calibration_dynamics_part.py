@@ -28,8 +28,8 @@ at drawn tasks, {earlier_95} were validated falsely at 0.95 d*, {misleading_95} 
 
 {present}
 
-Executions are medians with quartiles; "undecided" means that the budget did not suffice. A misleading system has an
-incomplete state, jumps or noise; `validated` is true of it as well at 1.1 d*.
+Executions are medians with quartiles; "undecided" means that the budget did not suffice. On {mislead} further
+systems with an incomplete state, jumps or noise, {mislead_above} were validated at 1.1 d*, which is true as well.
 
 - **Without a threshold** ({interval_seeds} seeds, at most {interval_budget} executions): campaigns end once the
   bound exceeds the largest executed distance by at most 5 %. {ended} of {intervals} ended; {low} of these had a
@@ -39,7 +39,7 @@ incomplete state, jumps or noise; `validated` is true of it as well at 1.1 d*.
   campaigns were validated falsely; `peak_ratio`, `jump`, `search_shortfall` and `disagreement` were added for this
   reason.
 - **The paper's cases** ({paper_seeds} seeds, at most {budget_paper} executions; the method was tried on them while
-  it was written): {paper_compared}
+  it was written). {paper_compared}
 
 Tables: [reporting systems](tables/calibration-dynamics.csv), [by earlier
 rules](tables/calibration-dynamics-earlier.csv), [false verdicts](tables/calibration-dynamics-false.csv), [without a
@@ -55,13 +55,13 @@ push that was found least often is `{push}`, in {found} campaigns ([table](table
 ### Ranks of the truth
 
 Systems are drawn from the prior that the posterior assumes, with seeds from {fresh} on; the method was chosen on
-other seeds. If the draws of the dynamics are right, 5 % of the true values lie below all 19 draws, 5 % above them,
-the variance of the ranks is 1 as a share of the expected one, and the p-values of a chi-squared test are uniform.
+other seeds. If the draws of the dynamics are right, 5 % of the true values lie below all 19 draws and 5 % above
+them, the spread (the variance of the ranks divided by the expected one) is 1, and the p-values of a chi-squared test
+are uniform.
 
 {ranks}
 
-[By number of states](tables/calibration-ranks.csv). `pairs` are random transitions, `loops` are those of closed
-loops."""
+[By number of states](tables/calibration-ranks.csv). `pairs` are random transitions, `loops` come from closed loops."""
 
 Result = dict[str, Any]
 
@@ -76,6 +76,7 @@ def by_dynamics() -> tuple[str, dict[str, Table]]:
     fresh = study_posterior_ranks.FRESH
     results = JsonLines(study_posterior_ranks.STORED, study_posterior_ranks.KEY)
     ranks = study_posterior_ranks.rows(results, range(fresh, fresh + 1000))
+    misleading = [one for one in present if _entry(one).misleading]
     hardest = min(timed, key=lambda row: int(row[-1].split()[0]))
     text = TEXT.format(
         systems=len({one["entry"] for one in present}),
@@ -84,7 +85,12 @@ def by_dynamics() -> tuple[str, dict[str, Table]]:
         earlier_95=false_of(_at(earlier, FALSE[0])),
         earlier_99=false_of(_at(earlier, FALSE[1])),
         misleading_95=false_of([one for one in _at(earlier, FALSE[0]) if _entry(one).misleading]),
-        present=table(["system", "tasks", "1.1 d*: validated", "executions"], _short(present)),
+        present=table(
+            ["system", "tasks", "1.1 d*: validated", "executions"],
+            _short([one for one in present if not _entry(one).misleading]),
+        ),
+        mislead=len({one["entry"] for one in misleading}),
+        mislead_above=_count(_at(misleading, TRUE[0]), "validated"),
         interval_seeds=study_interval.SEEDS,
         interval_budget=study_interval.BUDGET,
         intervals=len(intervals),
@@ -172,9 +178,8 @@ def _short(results: list[Result]) -> list[list[str]]:
     """Return a row for each system: how many campaigns above d* were validated, and their executions."""
     rows = []
     for name, own in _by_entry(results):
-        entry, above = _entry(own[0]), _at(own, TRUE[0])
-        kind = " (misleading)" if entry.misleading else ""
-        rows.append([name + kind, f"{entry.dimensions()[0]}-D", _count(above, "validated"), _executions(above)])
+        above = _at(own, TRUE[0])
+        rows.append([name, f"{_entry(own[0]).dimensions()[0]}-D", _count(above, "validated"), _executions(above)])
     return rows
 
 

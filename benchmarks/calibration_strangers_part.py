@@ -38,7 +38,7 @@ belong to the development half.
 
 [All designs of tests](tables/calibration-drawn-tests.csv).
 
-### What each diagnostic caught
+### Validations that each diagnostic prevented
 
 At {steps} steps of {campaigns} campaigns with a threshold below d*, the bound from learned dynamics was below the
 threshold, and only diagnostics prevented a validation. These were alone in this at some step:
@@ -72,11 +72,11 @@ def of_strangers() -> tuple[str, dict[str, Table]]:
         systems=len(ENTRIES),
         reporting=len(HALVES["reporting"]),
         budget=BUDGET,
-        count=len(results),
+        count=f"{len(results):,}",
         false=false_of(results),
         false_systems="`, `".join(dict.fromkeys(line["entry"] for line in false)),
         regular=of_regular(results),
-        families=table(ANSWERS, total(answers)),
+        families=table(["family", *(f"{share:g} d*: {', '.join(KINDS)}" for share in (0.95, 1.25))], total(answers)),
         drawn=false_of_drawn(),
         power=table(
             ["system", "met", "campaigns", "validated", "falsified", "undecided", "median executions"],
@@ -164,8 +164,13 @@ def by_family(results: list[dict[str, Any]]) -> list[list[str]]:
 
 def total(rows: list[list[str]]) -> list[list[str]]:
     """Return the rows of families with a false or undecided verdict, and the sum of all families."""
-    sums = [str(sum(int(row[column]) for row in rows)) for column in range(1, len(ANSWERS))]
-    return [*(row for row in rows if row[1] != "0" or row[3] != "0" or row[6] != "0"), [f"all {len(rows)}", *sums]]
+    sums = [f"all {len(rows)}", *(str(sum(int(row[k]) for row in rows)) for k in range(1, len(ANSWERS)))]
+    chosen = [row for row in rows if row[1] != "0" or row[3] != "0" or row[6] != "0"]
+    together = [[", ".join(row[1:4]), ", ".join(row[4:])] for row in (*chosen, sums)]
+    return [
+        [row[0], below, above if above != "0, 0, 0" else "-"]
+        for row, (below, above) in zip((*chosen, sums), together, strict=True)
+    ]
 
 
 def _met(row: list[str]) -> str:

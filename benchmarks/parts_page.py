@@ -17,8 +17,7 @@ INTRODUCTION = """\
 # Parts that are found by name
 
 This page is made from the registries by `make parts`, and a test fails if it is not current. In Python, every part is
-also a class or a function of its package. Installed packages can add parts: see [CONTRIBUTING](../CONTRIBUTING.md). A
-store that names such a part, or one marked *runs code*, needs trust: see [security](security.md).
+also a class or a function of its package. Installed packages can add parts: see [CONTRIBUTING](../CONTRIBUTING.md).
 """
 
 
@@ -66,7 +65,7 @@ def page() -> str:
 
 
 def _lines(section: Section) -> list[str]:
-    heading = [f"## {section.title}", "", f"{section.use}.", "", "| name | what it is | arguments |", "|---|---|---|"]
+    heading = [f"## {section.title}", "", f"{section.use}.", "", "| name | part | arguments |", "|---|---|---|"]
     return [*heading, *(_row(section.registry, name) for name in section.registry.built_in), ""]
 
 
@@ -76,7 +75,7 @@ def _row(registry: Registry, name: str) -> str:
         text, arguments = cases.text_of(name), ", ".join(_argument(*one) for one in plain_options(name).items())
         return _cells(f"`{name}`", text, arguments)
     declared = declaration_of(found) or Declaration(name)
-    text = registry.summary(name) + ("; *runs code*" if declared.runs_code else "")
+    text = registry.summary(name)
     arguments = _arguments(found, declared)
     if hasattr(found, "fit"):
         arguments += f"; or, to be learned from files: {_arguments(found.fit, declared)}"

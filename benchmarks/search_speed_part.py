@@ -9,9 +9,9 @@ from page_tables import Table, table
 
 TEXT = """## CPU time in comparison with an earlier revision
 
-`make bench` runs each script with the code of commit {landed} and with that of today, one after the other: processor
-seconds on one thread, medians over the repeats, with the smallest and largest ratio. Other programs ran on the machine.
-{met} of {asked} requested ratios are met; these are not:
+`make bench` runs each script with the code of commit {landed} and with the present code, one after the other:
+processor seconds on one thread, medians over the repeats, with the smallest and largest ratio. Other programs ran on
+the machine. {met} of {asked} requested ratios are met; these are not:
 
 {missed}
 

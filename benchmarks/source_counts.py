@@ -20,11 +20,37 @@ PATTERNS = {
     "except": r"^\s*except\b",
     "except, broad": r"^\s*except( (Base)?Exception\b|:)",
     "hand-written reprs": r"def __repr__",
-    "numeric module constants": r"^[A-Z_0-9]+(: [^=]+)? = [-\d]",
     "docstrings with Raises:": r"^\s*Raises:",
     "functions require_*": r"def _?require_",
     "locals named found, one, own, said, told": r"^\s+(found|one|own|said|told)(: [^=]+)? = ",
 }
+
+
+def is_numeric(value: ast.expr) -> bool:
+    """Return whether an expression is a number, or a tuple or an array of numbers."""
+    match value:
+        case ast.Constant():
+            return type(value.value) in (int, float)
+        case ast.UnaryOp():
+            return is_numeric(value.operand)
+        case ast.BinOp():
+            return is_numeric(value.left) and is_numeric(value.right)
+        case ast.Tuple() | ast.List() | ast.Set():
+            return bool(value.elts) and all(map(is_numeric, value.elts))
+        case ast.Call(func=ast.Attribute(value=ast.Name(id="np")) | ast.Name(id="range")):
+            return bool(value.args) and all(map(is_numeric, value.args))
+    return False
+
+
+def numeric_constants(text: str) -> list[str]:
+    """Return the names in capitals of a module that are numbers, or tuples or arrays of them: no fields of settings."""
+    names = list[str]()
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None and is_numeric(node.value):
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                parts = target.elts if isinstance(target, ast.Tuple) else [target]
+                names += [part.id for part in parts if isinstance(part, ast.Name) and part.id.isupper()]
+    return names
 
 
 def counts(source: Path) -> dict[str, float]:
@@ -41,6 +67,7 @@ def counts(source: Path) -> dict[str, float]:
         "files": len(texts),
         "functions": len(functions),
         "lines of a function, mean": round(statistics.mean(lengths), 1),
+        "numeric module constants": sum(len(numeric_constants(text)) for text in texts),
         **{name: sum(len(re.findall(pattern, text, re.M)) for text in texts) for name, pattern in PATTERNS.items()},
     }
 

@@ -110,7 +110,7 @@ TEXT = """# The envelope, measured
 
 `make envelope` makes this page. {count} campaigns of at most {budget} executions ran with `envelope=True` on
 {systems} systems that were not tuned on, at a threshold that 70 % of the tasks keep. [How to use an
-envelope](how-to/envelope.md) says what it is.
+envelope](how-to/envelope.md).
 
 **The median share found is {found:.0f} % over the systems. It is at least 80 % on {enough} of {systems} systems, of
 which {contacts} have contacts and {noisy} noise (the goal is 8, with 2 and 2). In {above} of {count} campaigns, more
@@ -134,7 +134,7 @@ The present version is {version}; the table also has campaigns of versions 9 and
 systems. Choices were made on development systems (cart-at-wall, gripper-on-floor, moored-boat, rail-cars,
 corner-stop), but results on reported systems led to some of them: four campaigns on smooth systems showed that an
 early interpolation lost much in five parameters; systems with contacts had no envelope until a missed test raised
-the factor (version 4), and until steps that touch something were left out of what draws learn (version 6); the
+the factor (version 4), and until steps that touch something were left out of the data of draws (version 6); the
 losses on table-top and oblique-wall led to a better interpolation (version 9); missing tests on noisy systems led to
 executions that are kept for them (version 10). Since version 8, runs to places that no execution entered are not
 trusted: this costs up to a third of the share found, and without it 1.05 % of a puck's tasks were falsely trusted.

@@ -210,7 +210,7 @@ def _deviation(plan: Any, model: models.Linear, disturbances: Array) -> Array:
 def files_of_page() -> dict[str, str]:
     """Return the files of ``docs/how-to/safety.md``, by name."""
     text = (Path(__file__).parents[1] / "docs" / "how-to" / "safety.md").read_text()
-    return dict(re.findall(r"```python\n# file: (\S+)\n(.*?)```", text, flags=re.DOTALL))
+    return dict(re.findall(r"```(?:python|toml)\n# file: (\S+)\n(.*?)```", text, flags=re.DOTALL))
 
 
 def picture() -> dict[str, Any]:

@@ -196,7 +196,7 @@ def state_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(autouse=True)
 def state_folder(state_folders: Iterator[Path], monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Give each test a user who has no key yet."""
+    """Give each test a user who has allowed nothing yet."""
     folder = next(state_folders)
     folder.mkdir()
     monkeypatch.setenv(STATE, str(folder))

@@ -35,7 +35,7 @@ NEEDS |= {"fit": ["mujoco", "sklearn", "onnx"]}
 NEEDS |= {"clusters": ["submitit", "ray", "distributed"]}
 NEEDS |= {"operate": ["starlette", "uvicorn", "jinja2", "python_multipart"]}
 LONG = ("aspect1", "causes", "clusters", "compare-controllers", "controllers", "envelope", "fit")
-LONG += ("gymnasium-and-network", "noise", "noisy-environment", "outputs", "read-certificate", "retrain", "safety")
+LONG += ("gymnasium-and-network", "noise", "noisy-environment", "outputs", "retrain", "safety")
 LONG += ("choose-threshold", "decide", "experiment-file", "fmu", "operate", "report", "start", "watch", "workers")
 LONG += ("replay",)  # an example and a script of the gallery replay recordings, too
 """Pages that only `make docs` and `make thorough` run: long campaigns, several of them, or many processes."""

@@ -35,7 +35,7 @@ from ctxval._util.files import (
     require_regular_file,
     written_whole,
 )
-from ctxval._util.tables import CsvTable
+from ctxval._util.tables import CsvTable, TableLimits
 from ctxval.cli.config.parts import recorded
 from ctxval.core.exchange import read_task
 from ctxval.errors import InputError, ShapeError
@@ -153,7 +153,7 @@ def test_more_rows_than_a_plan_has_are_not_read(tmp_path: Path) -> None:
 
 def test_numbers_of_csv_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.csv").write_text("t,x0\n" + "0,1\n" * 100)
-    monkeypatch.setattr("ctxval._util.tables.MOST_BYTES", 1000)
+    monkeypatch.setattr(CsvTable, "limits", TableLimits(numbers=1000))
     with pytest.raises(InputError, match="too many numbers: 1000 bytes may be read"):
         Trajectory.from_csv(tmp_path / "a.csv")
 

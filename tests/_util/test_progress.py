@@ -174,10 +174,9 @@ def test_a_log_says_that_long_work_goes_on(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(lines) == 2
 
 
-def test_a_screen_keeps_all_notes_and_forgets_the_stages(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress_display, "_DELAY", 0.0)
+def test_a_screen_keeps_all_notes_and_forgets_the_stages() -> None:
     screen = console(terminal=True)
-    with progress_shown(True, screen), stage("executions", 3):
+    with progress_shown(True, screen, 0.0), stage("executions", 3):
         with stage("choosing a task", 10, "designs"):
             advance(4)
         advance(1, "trial 0 has distance 1")
@@ -193,11 +192,10 @@ def test_a_screen_keeps_all_notes_and_forgets_the_stages(monkeypatch: pytest.Mon
 
 
 def test_the_clock_of_a_stage_runs_whatever_is_known_of_its_length(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress_display, "_DELAY", 0.0)
     now = iter(range(10_000))
     monkeypatch.setattr("time.monotonic", lambda: float(next(now)))
     for expected in (None, 100, 300):
-        shown = OnScreen(console(terminal=True))
+        shown = OnScreen(console(terminal=True), 0.0)
         for done in (0, 250, 260, 350):
             shown(Progress("searching", done, expected if expected is None or done <= expected else None, "loops"))
         (task,) = shown._bars.tasks

@@ -73,14 +73,8 @@ def test_a_part_is_made_by_name() -> None:
         models.by_name("Linear", A=[[1.0]])
 
 
-def test_only_built_in_parts_that_run_nothing_are_data() -> None:
-    assert systems.REGISTRY.is_data("Manual")
-    for name in ("FMU", "Gymnasium", "Subprocess", "Nothing", "a:b", "", None, 3, ["Manual"], {}):
-        assert not systems.REGISTRY.is_data(name), name
-
-
 def test_a_declaration_is_of_one_class_alone() -> None:
-    @part("mine", runs_code=True, files=("path",))
+    @part("mine", files=("path",))
     class Mine:
         pass
 
@@ -89,7 +83,7 @@ def test_a_declaration_is_of_one_class_alone() -> None:
 
     declared = declaration_of(Mine)
     assert declared is not None
-    assert (declared.name, declared.runs_code, declared.files) == ("mine", True, ("path",))
+    assert (declared.name, declared.files) == ("mine", ("path",))
     assert declaration_of(Derived) is None
     assert declaration_of([]) is None
 

@@ -20,6 +20,6 @@ def test_it_has_every_part_and_what_it_takes() -> None:
     for section in parts_page.SECTIONS:
         for name in section.registry.built_in:
             assert page.count(f"\n| `{name}` |") >= 1
-    assert "| `FMU` | An FMU for co-simulation, FMI 2 or 3, as the true system; *runs code* | `path` (a file)," in page
+    assert "| `FMU` | An FMU for co-simulation, FMI 2 or 3, as the true system | `path` (a file)," in page
     assert "`step` (a function `(x, u) -> x_next`)" in page
     assert "`**options`" in page

@@ -22,7 +22,6 @@ from ctxval.certificates import (
 )
 from ctxval.cli import app
 from ctxval.cli.config.settings import read_settings
-from ctxval.cli.config.trust import code_named
 from ctxval.core.space import DISTRIBUTION
 from ctxval.core.task_distribution import distribution_text
 from ctxval.errors import CtxvalError, InputError, StoreMismatchError, UnknownNameError
@@ -179,7 +178,6 @@ def test_a_file_names_any_distribution_of_scipy_or_a_function_that_draws_tasks(
     assert np.abs(drawn).max() <= most
     assert drawn.std() > 0.3
     assert text in str(distribution_text(space.describe()[DISTRIBUTION]))
-    assert any("drawn_tasks" in one for one in code_named(settings.model_dump(mode="json")))
 
 
 def test_uniform_may_be_stated(tmp_path: Path) -> None:

@@ -154,7 +154,7 @@ def test_code_of_another_user_is_asked_about_first(tmp_path: Path, monkeypatch: 
     assert invoke("certify", "r.sqlite", "--kind", "audit").exit_code == 0  # runs no code
     foreign = invoke("certify", "r.sqlite", "--kind", "region")
     assert foreign.exit_code == 2
-    assert "would import or run code" in foreign.stderr
+    assert "would build its experiment" in foreign.stderr
     assert "give --trust" in foreign.stderr
     named = invoke("certify", "r.sqlite", "--kind", "region", "--experiment", "rotor.toml")
     assert named.exit_code == 0, named.output

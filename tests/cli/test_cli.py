@@ -19,6 +19,7 @@ from conftest import make_validation
 from ctxval import Campaign, Store, TaskSpace, Validation, __version__, searches
 from ctxval.cli import app
 from ctxval.cli.commands import MODULES, PANELS, TEXTS
+from ctxval.cli.config.trust import allow
 from rig_thorough import more
 
 EXPERIMENT = """
@@ -329,6 +330,11 @@ class Stores(dict[str, Path]):
         for each in (case, f"{case} drawn"):
             self[each] = stored(self.folder, *self.commands[each])
         return self[name]
+
+    def __getitem__(self, name: str) -> Path:
+        path = super().__getitem__(name)
+        allow(Store(path).settings())  # also for the user of this test
+        return path
 
 
 @pytest.fixture(scope="session")

@@ -144,7 +144,7 @@ def test_a_store_of_somebody_else_runs_no_code(
     assert "without the experiment" in done.output
     page = Path("other.html").read_text(encoding="utf-8")
     assert "The experiment is not loaded" in page
-    assert "would import or run code" in page
+    assert "would build its experiment" in page
     done = invoke("report", str(store), "--experiment", "short_rig:experiment", "-o", "named.html")
     assert done.exit_code == 0, done.output
     assert "angle [rad]" in Path("named.html").read_text(encoding="utf-8")

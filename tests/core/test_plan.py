@@ -170,9 +170,9 @@ def test_a_horizon_that_is_too_long_is_refused_with_its_cost() -> None:
     assert long(20, longest=20).plan([0.5]).task.horizon == 20
 
 
-def test_the_cost_of_a_long_horizon_is_stated_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ctxval.core.validation._LONG", 50)
+def test_the_cost_of_a_long_horizon_is_stated_once() -> None:
     validation = long(60)
+    validation.cost_stated_from = 50
     with pytest.warns(CostWarning, match="each plan with a horizon of 60 needs about"):
         validation.plan([0.5])
     with warnings.catch_warnings():

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ctxval.data import LogMapping, read_logs, read_recordings
+from ctxval.data.log import MessageLimits, TopicLog
 from ctxval.errors import InputError
 from rig_logs import run, write_bag1
 from rig_thorough import more
@@ -110,7 +111,7 @@ def test_a_chunk_that_is_much_larger_than_its_file_is_not_decompressed(
     from mcap.writer import CompressionType, Writer
 
     if most != 2**27:  # the limit of users, with which one case is enough
-        monkeypatch.setattr("ctxval.data.messages._MOST_CHUNK", most)
+        monkeypatch.setattr(TopicLog, "limits", MessageLimits(chunk=most))
     padding = most // 128
     path = tmp_path / "a.mcap"
     with path.open("wb") as file:
@@ -133,7 +134,7 @@ def test_a_chunk_that_is_much_larger_than_its_file_is_not_decompressed(
 def test_messages_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from rig_logs import write_mcap_json
 
-    monkeypatch.setattr("ctxval.data.log._MOST_MEMORY", 10_000)
+    monkeypatch.setattr(TopicLog, "limits", MessageLimits(numbers=10_000))
     write_mcap_json(tmp_path / "a.mcap", run(60))
     with pytest.raises(InputError, match=r"a\.mcap has too many numbers: 10000 bytes of memory may be used"):
         read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": ["/state.cart.position"]}))
@@ -167,7 +168,7 @@ def test_a_compressed_bag_that_is_much_larger_than_it_looks_is_refused(
     write_bag1(tmp_path / "a.bag", run(60))
     mapping = LogMapping.from_table({"states": ["/joints.position[0]"]})
     assert read_recordings([tmp_path / "a.bag"], mapping).steps == 60
-    monkeypatch.setattr("ctxval.data.messages._MOST_CHUNK", 1000)
+    monkeypatch.setattr(TopicLog, "limits", MessageLimits(chunk=1000))
     with pytest.raises(InputError, match="a chunk has more than 1000 bytes"):
         read_recordings([tmp_path / "a.bag"], mapping)
 

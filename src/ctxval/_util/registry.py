@@ -33,7 +33,6 @@ class Declaration:
 
     name: str = ""  # the name of the class by default
     _: KW_ONLY
-    runs_code: bool = False  # whether plain arguments, such as a text, can make it run a program, a library, a module
     files: tuple[str, ...] = ()  # arguments that are paths of files
     folder: str | None = None  # the argument that is a folder, which is the experiment's by default
     functions: Mapping[str, str] = field(default_factory=dict)  # arguments that are functions: (x, u) -> x_next
@@ -94,13 +93,6 @@ class Registry(Mapping[str, Any], Generic[Made]):
         with suppress(InputError):
             return tuple(sorted({point.name for point in self._entry_points()} - {*self.built_in}))
         return ()
-
-    def is_data(self, name: Any) -> bool:
-        """Return whether a built-in part with plain arguments runs no code; nothing is imported for that."""
-        if not isinstance(name, str) or name not in self.built_in:
-            return False
-        declared = declaration_of(self._exported.get(name))
-        return declared is None or not declared.runs_code
 
     def find(self, name: str) -> Any:
         if name in self._exported:

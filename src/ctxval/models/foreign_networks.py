@@ -61,7 +61,7 @@ class Onnx:
         return {**self.network.describe(), "increments": self.increments}
 
 
-@part(runs_code=True)
+@part()
 class Torch:
     """A torch module as a model, with the exact Jacobian of its automatic differentiation.
 

@@ -33,7 +33,7 @@ from ctxval.systems.subprocess import signal_name
 _PROGRAM = Path(__file__).with_name("fmu_process.py")
 
 
-@part(runs_code=True, files=("path",))
+@part(files=("path",))
 class FMU:
     """An FMU for co-simulation, FMI 2 or 3, as the true system.
 

@@ -22,7 +22,7 @@ from ctxval.errors import InputError, ShapeError
 from ctxval.systems.episode import require_one, require_started, run_episode
 
 
-@part(runs_code=True, functions={"get_state": "environment -> x", "set_state": "(environment, x)"})
+@part(functions={"get_state": "environment -> x", "set_state": "(environment, x)"})
 class Gymnasium:
     """A gymnasium environment with continuous actions as the true system.
 

@@ -121,7 +121,7 @@ def _end(supervisor: subprocess.Popen[bytes], child: int, grace: float) -> None:
                 os.killpg(child, signal.SIGKILL)
 
 
-@part(runs_code=True, folder="folder")
+@part(folder="folder")
 class Subprocess:
     """A command that executes one task, as the true system.
 

@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from ctxval.cli.config.settings import ExperimentSettings
-from ctxval.cli.config.trust import code_named
 from ctxval.distances import MaximumDeviation, UnsafeMargin
 from ctxval.errors import InputError
 
@@ -21,10 +20,6 @@ def test_a_named_experiment_may_be_judged_by_a_specification() -> None:
     assert (experiment.threshold, experiment.units, experiment.truth) == (0.1, "rad", None)
     assert experiment.validation.distance.spec.components == (0,)
     assert not isinstance(settings.model_copy(update={"judge": "distance"}).load().validation.distance, UnsafeMargin)
-
-
-def test_a_specification_names_no_code() -> None:
-    assert code_named({"spec": SPEC, "judge": "spec"}) == []
 
 
 def test_a_specification_that_is_missing_is_asked_for() -> None:

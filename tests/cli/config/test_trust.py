@@ -1,4 +1,4 @@
-"""A store is data: what it names is imported or run only for the user who made it, or who says so."""
+"""A store is data: what it names is built only for the user who made it, or who says so."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ctxval import Store
 from ctxval.cli import app
 from ctxval.cli.config.settings import read_settings
 from ctxval.cli.config.stored_settings import planned_settings, trusted_settings
-from ctxval.cli.config.trust import allow, allowed_folder, code_named, is_allowed
+from ctxval.cli.config.trust import allow, allowed_folder, is_allowed
 from ctxval.errors import InputError
 from rig_packages import install
 
@@ -172,7 +172,7 @@ def test_nothing_that_a_foreign_store_names_is_imported_or_run(attack: str, fold
     before = set(sys.modules)
     for command in COMMANDS.values():
         said = refusal(*command)
-        assert "would import or run code" in said
+        assert "would build its experiment" in said
         assert "--trust" in said
         assert "--experiment FILE.toml" in said
     assert not Path("PWNED").exists()
@@ -230,11 +230,6 @@ def test_what_is_shown_of_a_store_steers_no_terminal(folder: Path) -> None:
     assert len(said) < 1_500
 
 
-def test_many_things_are_shown_in_part(folder: Path) -> None:
-    store_with({**PLAIN, "search": {"name": "auto", **{f"x{i}": {"ref": "evil:x"} for i in range(1_000)}}})
-    assert "and 992 more" in refusal("ask", "a.sqlite")
-
-
 # Whose store it is
 
 
@@ -253,9 +248,10 @@ def test_a_store_of_another_user_is_asked_about_once(
     rig_store(folder)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("other")))
     said = refusal("ask", "a.sqlite")
-    assert f"experiment = 'my_rig:experiment', from the folder '{folder}'" in said
+    assert "experiment = 'my_rig:experiment'" in said
+    assert "from the folder '" in said  # its middle is left out if it is long
     assert not Path("imported.txt").exists()
-    assert "a.sqlite is now allowed to run its code" in done("ask", "a.sqlite", "--trust").stderr
+    assert "a.sqlite is now allowed" in done("ask", "a.sqlite", "--trust").stderr
     assert "allowed" not in done("ask", "a.sqlite").stderr
     # and its first user is not asked either
     monkeypatch.setenv("XDG_STATE_HOME", str(state_folder))
@@ -304,65 +300,30 @@ def test_where_code_is_sought_is_known_of_settings_from_python_too(folder: Path)
     for settings in ({"experiment": "my_rig:experiment", "folder": None}, {"experiment": "my_rig:experiment"}):
         allow(settings)
         Store("a.sqlite").keep_settings(settings)
-        assert "would import or run code" in refusal("ask", "a.sqlite")
+        assert "would build its experiment" in refusal("ask", "a.sqlite")
 
 
-def test_a_store_without_code_is_anybodys(folder: Path) -> None:
-    store_with(PLAIN)
-    done("tell", "a.sqlite", "0", "--distance", "0.1")
+def test_a_store_of_plain_numbers_is_asked_about_too(folder: Path) -> None:
+    store_with({**PLAIN, "model": {"type": "Onnx", "source": "/home/you/network.onnx"}})
+    said = refusal("ask", "a.sqlite")
+    assert "network.onnx" in said
+    assert f"from the folder '{folder}'" in said
     assert "--experiment and --trust need a store as the first argument" in refusal("ask", "pendulum", "--trust")
     settings = read_settings("linear", {"search": "random", "threshold": 99.0})
     settings.campaign(settings.load(), Path("p.sqlite")).run(budget=2)
-    assert not allowed_folder().exists()
     done("certify", "p.sqlite", "--audit", "3")
+    shutil.rmtree(allowed_folder())
+    refusal("certify", "p.sqlite", "--audit", "3")
 
 
-def test_a_store_of_an_older_version_asks_where_it_names_code(folder: Path) -> None:
+def test_a_store_of_an_older_version_is_asked_about(folder: Path) -> None:
     rig_store(folder)
     old = {k: v for k, v in Store("a.sqlite").settings().items() if k != "folder"}
     Store("a.sqlite").keep_settings(old)
-    assert "an older version made it" in refusal("ask", "a.sqlite")
+    refusal("ask", "a.sqlite")
     done("ask", "a.sqlite", "--trust")
     assert Store("a.sqlite").settings()["folder"] == str(folder)
     done("ask", "a.sqlite")
-
-
-MODEL_OUTSIDE: dict[str, dict[str, Any]] = {
-    "data": {"type": "Linear", "data": "../secret.csv"},
-    "a list": {"type": "Linear", "data": ["runs.csv", "/etc/passwd"]},
-    "logs": {"type": "Linear", "data": {"logs": "../secret.csv", "states": {}, "inputs": {}}},
-    "a network": {"type": "Onnx", "source": "/home/you/network.onnx"},
-    "a link": {"type": "Onnx", "source": "link/network.onnx"},
-    "a mesh": {"type": "MuJoCo", "mjcf": "<mujoco><asset><mesh file='/home/you/a.stl'/></asset></mujoco>"},
-    "another folder": {"type": "Saved", "source": "model.npz"},
-}
-
-
-@pytest.mark.parametrize("name", MODEL_OUTSIDE)
-def test_a_foreign_store_without_code_names_no_file_outside_its_folder(name: str, folder: Path) -> None:
-    (folder / "link").symlink_to("/")
-    elsewhere = {"folder": "/home/you"} if name == "another folder" else {}
-    store_with({**PLAIN, "model": MODEL_OUTSIDE[name], **elsewhere})
-    for command in (
-        ("ask", "a.sqlite"),
-        ("report", "a.sqlite", "--out", "r.html"),
-        ("certify", "a.sqlite", "--audit", "3"),
-    ):
-        invoked = invoke(*command)
-        assert "names files outside its folder" in f"{invoked.output} {invoked.stderr}" or invoked.exit_code == 0
-        assert invoked.exit_code == 2 or command[0] == "report"
-    with pytest.raises(InputError, match=r"names files outside its folder: .* --experiment FILE.toml"):
-        trusted_settings(Store("a.sqlite"))
-    assert trusted_settings(Store("a.sqlite"), trust=True).model == MODEL_OUTSIDE[name]
-
-
-def test_a_store_names_files_in_its_folder_and_its_user_any_file(folder: Path) -> None:
-    store_with({**PLAIN, "model": {"type": "Linear", "data": "runs/a.csv"}})
-    assert trusted_settings(Store("a.sqlite")).model is not None
-    outside = {**PLAIN, "model": MODEL_OUTSIDE["data"]}
-    store_with({**outside, "folder": str(folder)}, "own.sqlite")
-    allow(Store("own.sqlite").settings())
-    assert trusted_settings(Store("own.sqlite")).model == MODEL_OUTSIDE["data"]
 
 
 def test_an_experiment_that_was_moved_is_named_where_it_is_now(folder: Path) -> None:
@@ -405,7 +366,6 @@ def test_a_foreign_store_imports_no_part_of_an_installed_package(attack: str, si
         assert invoke(*command).exit_code in (0, 1, 2)
     for command in COMMANDS.values():
         refusal(*command)
-    assert code_named(INSTALLED[attack])
     assert "their_parts" not in sys.modules
     assert not (site / "imported.txt").exists()
 
@@ -419,7 +379,7 @@ def test_what_the_user_names_may_be_of_an_installed_package(site: Path) -> None:
     shutil.rmtree(allowed_folder())
     said = refusal("ask", "a.sqlite")  # it is not any more
     assert "distance = 'Speed'; search = {'name': 'corners', 'repeats': 1}" in said
-    assert "is now allowed to run its code" in done("ask", "a.sqlite", "--trust").stderr
+    assert "is now allowed" in done("ask", "a.sqlite", "--trust").stderr
     done("ask", "a.sqlite")
 
 
@@ -458,7 +418,7 @@ def test_naming_the_experiment_replaces_what_the_store_names(folder: Path) -> No
     Store("a.sqlite").keep_settings({**Store("a.sqlite").settings(), "experiment": "evil:experiment"})
     named = ("--experiment", "my_rig:experiment")
     assert "--trust and --experiment cannot be given together" in refusal("ask", "a.sqlite", *named, "--trust")
-    assert "is now allowed to run its code" in done("tell", "a.sqlite", "0", "--distance", "0.1", *named).stderr
+    assert "is now allowed" in done("tell", "a.sqlite", "0", "--distance", "0.1", *named).stderr
     assert Store("a.sqlite").settings()["experiment"] == "my_rig:experiment"
     done("ask", "a.sqlite")
     assert not Path("PWNED").exists()
@@ -468,7 +428,7 @@ def test_another_experiment_is_refused_and_allows_nothing(folder: Path) -> None:
     store_with(HOSTILE)
     assert "was made by another experiment" in refusal("ask", "a.sqlite", "--experiment", "pendulum")
     assert Store("a.sqlite").settings() == HOSTILE
-    assert not allowed_folder().exists()
+    assert not is_allowed(HOSTILE)
 
 
 def test_seed_and_search_remain_the_stores(folder: Path) -> None:
@@ -551,7 +511,7 @@ def test_without_a_place_for_the_list_the_question_is_asked_again(folder: Path, 
     done("ask", "my_rig:experiment", "--store", "a.sqlite")
     refusal("ask", "a.sqlite")
     said = done("ask", "a.sqlite", "--trust").stderr
-    assert "allowed to run its code only now, and the question will be asked again" in said
+    assert "allowed only now, and the question will be asked again" in said
     refusal("ask", "a.sqlite")
 
 
@@ -570,31 +530,11 @@ def test_numbers_and_texts_survive_the_store(folder: Path) -> None:
     assert is_allowed(Store("a.sqlite").settings())
 
 
-# What is code
-
-
-def test_what_is_data_names_no_code() -> None:
-    assert code_named(PLAIN) == []
-    assert code_named({"experiment": "pendulum", "options": {"variant": "basin"}}) == []
-    assert code_named({**PLAIN, "system": "Manual", "distance": {"type": "FinalState", "norm": 2}}) == []
-    assert code_named({**PLAIN, "model": {"type": "Onnx", "source": "a.onnx"}}) == []
-
-
-@pytest.mark.parametrize("attack", ATTACKS)
-def test_whatever_is_not_known_to_be_data_is_code(attack: str) -> None:
-    assert code_named(ATTACKS[attack])
-
-
-def test_unknown_parts_and_odd_values_are_code() -> None:
-    for value in ("Popen", {"type": "Popen"}, {"type": 3}, {"type": ["x"]}, 3, ["Linear"]):
-        assert code_named({**PLAIN, "model": value}), value
-
-
-def test_what_is_nested_too_deeply_is_code() -> None:
+def test_what_is_nested_too_deeply_is_not_allowed() -> None:
     value: Any = {}
     for _ in range(100_000):
         value = [value]
-    assert code_named({"options": {"x": value}})
+    assert not is_allowed({"options": {"x": value}})
 
 
 def test_stored_settings_are_read_before_they_are_allowed(folder: Path) -> None:

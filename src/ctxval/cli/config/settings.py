@@ -23,7 +23,7 @@ from ctxval.certificates.prediction_tests import TESTS
 from ctxval.cli.config import parts
 from ctxval.cli.config.parts import argument, part, require_types
 from ctxval.cli.config.references import reference, require_function
-from ctxval.cli.config.trust import allow, code_named
+from ctxval.cli.config.trust import allow
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.quantiles import QUANTILE
 from ctxval.data import LogMapping
@@ -215,7 +215,7 @@ class ExperimentSettings(BaseModel, extra="forbid"):
     def campaign(
         self, experiment: Experiment, store: Store | Path, *, accept_change: str | None = None, remeasure: bool = False
     ) -> Campaign:
-        """Return a campaign, with these settings in its store; later commands may run the code that they name."""
+        """Return a campaign, with these settings in its store; later commands may build the experiment from them."""
         campaign = Campaign(
             experiment.validation,
             search=self.search.build(self.folder),
@@ -226,11 +226,9 @@ class ExperimentSettings(BaseModel, extra="forbid"):
             remeasure=remeasure,
         )
         plain = self.model_dump(mode="json", exclude={"store", "aspect1"})
-        if self.folder is None and code_named(plain):
-            plain["folder"] = str(Path().resolve())  # the folder in which its code was found now
+        plain["folder"] = str(self.folder or Path().resolve())  # in which modules and files were found now
         campaign.store.keep_settings(plain)
-        if plain["folder"] is not None:
-            allow(plain)
+        allow(plain)
         return campaign
 
     def certified_as(self, stated: dict[str, Any]) -> ExperimentSettings:

@@ -1,9 +1,8 @@
-"""The settings in a store, those that may be used, since this user allows the code that they name, and the campaign."""
+"""The settings in a store, those that may be used, since this user allows them, and the campaign."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
+import reprlib
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,15 +10,14 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from ctxval import Campaign, Experiment, Store
+from ctxval import Campaign, Experiment, Store, searches
 from ctxval._util.checked import PositiveFloat, PositiveInt, require
-from ctxval._util.registry import declaration_of
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.certificates import KINDS
 from ctxval.cli.base import Allowed, err
 from ctxval.cli.config.parts import REGISTRIES
 from ctxval.cli.config.settings import ExperimentSettings, not_an_experiment, read_settings, sentence_of
-from ctxval.cli.config.trust import allow, code_named, is_allowed
+from ctxval.cli.config.trust import allow, is_allowed
 from ctxval.errors import InputError
 
 
@@ -30,7 +28,7 @@ def planned_settings(store: Store, kind: str | None = None) -> ExperimentSetting
         return ExperimentSettings()
     settings = _of_store(kept)
     planned = settings.certificate.kind
-    if kind is None and not KINDS.is_data(planned) and not is_allowed(kept):
+    if kind is None and planned not in KINDS.built_in and not is_allowed(kept):
         why = f"{store.name} names the certificate {planned!r}, which is code of another package"
         how = f"Give --kind {planned} if you trust that package, or give another kind."
         raise InputError(f"{why}, and you did not make the store. {how}")
@@ -57,53 +55,30 @@ def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool
         with suppress(InputError):
             stored = _of_store(kept)
             same["seed"] = stored.seed
-            if not code_named({"search": kept.get("search", {})}):
+            plain = not any(isinstance(value, dict) for value in (stored.search.model_extra or {}).values())
+            if plain and stored.search.name in searches.REGISTRY.built_in:  # which names no code
                 same["search"] = stored.search
         return named.model_copy(update=same)
-    settings, code = _of_store(kept), code_named(kept)
+    settings = _of_store(kept)
     folder = settings.folder or Path().resolve()
-    outside = [] if store.path is None else _files_outside(kept, folder, store.path.resolve().parent)
-    if not (code or outside) or (settings.folder is not None and is_allowed(kept)):
+    if is_allowed(kept) and settings.folder is not None:
         return settings
     if trust:
         return settings.model_copy(update={"folder": folder})
+    keys = ("experiment", "options", "task", *REGISTRIES, "distribution", "search", "certificate", "spec", "outputs")
+    stated = [f"{key} = {_SHOWN.repr(kept[key])}" for key in (*keys, "recordings", "refined") if kept.get(key)]
+    where = f"{store.path} would build its experiment, which may import modules and run programs"
     unknown = "You did not make the store on this computer, or it was changed since"
-    known = "If you know its experiment, name it with --experiment FILE.toml (or module:attr). If you trust the"
-    if not code:
-        files = f"files outside its folder: {'; '.join(outside[:8])}"
-        raise InputError(f"{store.path} names {files}. {unknown}. {known} store, give --trust.")
-    more = f" and {len(code) - 8} more" if len(code) > 8 else ""
-    what = f"{'; '.join(code[:8])}{more}, from the folder {ascii(str(folder))[:200]}"
-    then = "The question will then not be asked again."
-    known = f"{unknown}, or an older version made it. {known} code that the store names, give --trust"
-    raise InputError(f"{store.path} would import or run code: {what}. {known}. {then}")
+    known = "If you know its experiment, name it with --experiment FILE.toml (or module:attr)"
+    then = "If you trust what the store names, give --trust; the question will then not be asked again"
+    what = f"{'; '.join(stated)}, from the folder {_SHOWN.repr(str(folder))}"
+    raise InputError(f"{where}: {what}. {unknown}. {known}. {then}.")
 
 
-_PARTS = (declaration_of(registry.find(name)) for registry in REGISTRIES.values() for name in registry.built_in)
-
-_FILE_KEYS = {"refined", "data", "logs"}.union(*(declared.files for declared in _PARTS if declared))
-"""The keys of settings whose texts are paths."""
-
-
-def _files_outside(kept: dict[str, Any], folder: Path, home: Path) -> list[str]:
-    """Return the files that settings name outside a folder, each as a text to show."""
-    parts = {key: value for key, value in kept.items() if key in (*REGISTRIES, "refined")}
-    in_xml = re.compile(r"""(?:file|dir)\s*=\s*["']([^"']+)""")
-    named = [name for text in _texts(parts, False) for name in (in_xml.findall(text) if "<" in text else [text])]
-    return [ascii(name)[:200] for name in named if "\0" in name or not (folder / name).resolve().is_relative_to(home)]
-
-
-def _texts(value: Any, path: bool) -> Iterator[str]:
-    """Yield the texts in settings that are paths, or a MuJoCo model as its text."""
-    match value:
-        case {}:
-            for key, item in value.items():
-                yield from _texts(item, path or key in _FILE_KEYS)
-        case [*items]:
-            for item in items:
-                yield from _texts(item, path)
-        case str() if path:
-            yield value
+# Settings of anybody as text: shortened, and with control characters escaped.
+_SHOWN = reprlib.Repr()
+_SHOWN.maxstring = _SHOWN.maxother = 160
+_SHOWN.maxdict = 8
 
 
 # Campaigns
@@ -147,10 +122,10 @@ def open_store(path: Path, allowed: Allowed, *, remeasure: bool = False) -> Open
         how = "name the experiment at its present place with --experiment FILE.toml or module:attr"
         raise InputError(f"{error} {gone}: {how}.") from error
     campaign = settings.campaign(experiment, store, accept_change=allowed.accept_change, remeasure=remeasure)
-    if asked and code_named(store.settings()):
-        does = "is now allowed to run its code, and the question will not be asked again"
+    if asked:
+        does = "is now allowed, and the question will not be asked again"
         if (reason := allow(store.settings())) is not None:
-            does = f"is allowed to run its code only now, and the question will be asked again: {reason}"
+            does = f"is allowed only now, and the question will be asked again: {reason}"
         err.say(f"{path} {does}.")
     return Opened(settings, experiment, campaign, path)
 

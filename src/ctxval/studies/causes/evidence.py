@@ -16,11 +16,16 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.studies.causes.cause import Cause, CauseCandidate, Repaired
 from ctxval.studies.causes.flow import Linearisation
 
-STEPS = (1, 6)  # of the predictions
-_LARGEST = 1e3  # of a residual, as a multiple of the typical one of M
-_DRAWS = 4  # of noise
-_LONGER = 4  # times as many steps, with which shares are measured if there is noise
-_UNKNOWN = 1e3  # a standard deviation
+
+@dataclass(frozen=True)
+class EvidenceSettings:
+    """Of which predictions evidence is, and how far an outlier counts."""
+
+    steps: tuple[int, int] = (1, 6)  # of the predictions
+    largest: float = 1e3  # residual that counts, as a multiple of the typical one of M
+    draws: int = 4  # of noise
+    longer: int = 4  # times as many steps, with which shares are measured if there is noise
+    unknown: float = 1e3  # standard deviation of a share that nothing tells
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +51,10 @@ class Evidence:
         runs: Sequence[Trajectory],
         floors: Sequence[Array] | None = None,
         most: tuple[int, int] = (600, 120),
-        steps: tuple[int, int] = STEPS,
+        settings: EvidenceSettings = EvidenceSettings(),
         known: tuple[Cause, ...] = (),
     ) -> None:
+        self.settings = settings
         self.model, self.known, self.horizons = model, known, [len(run.inputs) for run in runs]
         self.states = np.concatenate([run.states for run in runs])
         self.inputs = np.zeros((len(runs), max(self.horizons), runs[0].inputs.shape[1]))
@@ -56,7 +62,7 @@ class Evidence:
             padded[: len(run.inputs)] = run.inputs
         self.windows, self.sizes = list[Predictions](), list[Array]()
         self._missed = dict[int, tuple[Array, Mask]]()  # by M after a number of steps, and which of it is evidence
-        for number, length in enumerate(steps):
+        for number, length in enumerate(settings.steps):
             window = self._window(min(length, min(self.horizons)), most[number])
             left = self.left_by(Repaired(model, ()), window)
             changes = _size(self._gap(self.states[window.states + window.steps] - self.states[window.states]))
@@ -109,7 +115,7 @@ class Evidence:
     def noise(self, repaired: Repaired) -> Array:
         """Return the standard deviations ``(n,)`` of white noise of measurements, as residuals of one step show it."""
         left = self.left_by(repaired, self._window(1, len(self.states)))
-        left = np.nan_to_num(left / self.sizes[0], nan=_LARGEST).clip(-_LARGEST, _LARGEST)
+        left = self.limited(left / self.sizes[0])
         # The noise of a measurement enters two successive residuals, with opposite signs.
         runs = np.split(left, np.cumsum(self.horizons)[:-1])
         products = np.concatenate([run[1:] * run[:-1] for run in runs])
@@ -128,10 +134,16 @@ class Evidence:
         in fits are therefore taken only if noise, with standard deviations ``(n,)``, then hides less of the effect.
         """
         steps, shortest = self.windows[1].steps, min(self.horizons)
-        lengths = [steps, *({min(_LONGER * steps, shortest)} - {steps} if noise.any() else ())]
+        lengths = [steps, *({min(self.settings.longer * steps, shortest)} - {steps} if noise.any() else ())]
         return min((self._explained(repaired, noise, length) for length in lengths), key=lambda result: result[1])
 
+    def limited(self, ratios: Array) -> Array:
+        """Return residuals as multiples of typical ones, within the largest that counts."""
+        most = self.settings.largest
+        return np.nan_to_num(ratios, nan=most).clip(-most, most)
+
     def _explained(self, repaired: Repaired, noise: Array, steps: int) -> tuple[float, float]:
+        settings = self.settings
         window, rng = self._window(steps, len(self.states)), np.random.default_rng(0)
         if steps not in self._missed:
             changes = _size(self._gap(self.states[window.states + steps] - self.states[window.states]))
@@ -139,27 +151,27 @@ class Evidence:
             self._missed[steps] = missed, missed > 2e-3 * np.maximum(changes, 1e-12)
         sizes, matter = self._missed[steps]
         if not matter.any():
-            return 0.0, _UNKNOWN
-        most = _LARGEST * np.maximum(sizes, 1e-15)
+            return 0.0, settings.unknown
+        most = settings.largest * np.maximum(sizes, 1e-15)
         errors = np.nan_to_num(self.left_by(repaired, window), nan=np.inf).clip(-most, most)
         by_noise = noise**2
-        for _ in range(_DRAWS if noise.any() else 0):
+        for _ in range(settings.draws if noise.any() else 0):
             moved = self.left_by(repaired, window, noise * rng.standard_normal(errors.shape)).clip(-most, most)
-            by_noise = by_noise + np.nan_to_num((moved - errors) ** 2).mean(axis=0) / _DRAWS
+            by_noise = by_noise + np.nan_to_num((moved - errors) ** 2).mean(axis=0) / settings.draws
         squares = np.stack([(errors**2).mean(axis=0), sizes**2, by_noise])[:, matter] / sizes[matter] ** 2
         left, before, spread = squares[0] - squares[2], squares[1] - squares[2], squares[2]
         whole = float(before.sum())
         if whole <= 0:
-            return 0.0, _UNKNOWN
+            return 0.0, settings.unknown
         # Every second prediction is independent of the others.
         uncertainty = float(np.sqrt((spread**2).sum() * 4 / len(errors))) / whole
-        return 1.0 - max(float(left.sum()), 0.0) / whole, min(uncertainty, _UNKNOWN)
+        return 1.0 - max(float(left.sum()), 0.0) / whole, min(uncertainty, settings.unknown)
 
     def measured(self, repaired: Repaired) -> tuple[float, float]:
         """Return minus twice the log-likelihood, and the share of the squared residuals of M that is left."""
         misfit, left = 0.0, 0.0
         for window, sizes in zip(self.windows, self.sizes, strict=True):
-            most = _LARGEST * sizes
+            most = self.settings.largest * sizes
             errors = np.nan_to_num(self.left_by(repaired, window), nan=np.inf).clip(-most, most)
             squares = (errors**2).mean(axis=0)
             misfit += len(errors) * float(np.log((squares + window.floors**2) / sizes**2).sum())
@@ -251,7 +263,7 @@ class _Fit:
         """Return residuals in given sizes, whose squares are means over the predictions of each window."""
         model, parts = self.repaired(theta), []
         for window, size in zip(self.evidence.windows, sizes, strict=True):
-            left = np.nan_to_num(self.evidence.left_by(model, window) / size, nan=_LARGEST).clip(-_LARGEST, _LARGEST)
+            left = self.evidence.limited(self.evidence.left_by(model, window) / size)
             parts.append(left.ravel() / np.sqrt(len(left)))
         return np.concatenate(parts)
 

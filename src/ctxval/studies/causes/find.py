@@ -23,18 +23,23 @@ from ctxval.learning.extended import estimates_by_loops_on_model
 from ctxval.models import MuJoCo
 from ctxval.studies.causes import mechanics, signals
 from ctxval.studies.causes.cause import Cause, CauseCandidate, Plant, Repaired, of_size, plant_of
-from ctxval.studies.causes.evidence import STEPS, Evidence, Explanation, explained, screened
+from ctxval.studies.causes.evidence import Evidence, EvidenceSettings, Explanation, explained, screened
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
 
-_DRAWS = 12  # of noise
-_ALIKE = 10.0  # differences of the criterion that do not tell causes apart
-_NAMED = 0.98  # share of the squared deviations of M in closed loop that causes must explain, to be the cause
-_LITTLE = 0.1  # share of the squared deviations that is not worth a sentence
-_FITTED = 8  # explanations by one more cause that are fitted to all records
-_CHECKED = 4  # explanations that are tried in closed loop
-_FAILED = 4  # executions that failed
-_AWAY = 30.0  # ranges of the states that M promised, from where on a failed execution says nothing of M
-_STEPS = 5  # of a failed execution
+
+@dataclass(frozen=True)
+class CauseSettings:
+    """How many causes are tried, and how much of the deviations of M they must explain."""
+
+    named: float = 0.98  # share of the squared deviations of M in closed loop that causes must explain, to be the cause
+    little: float = 0.1  # share of the squared deviations that is not worth a sentence
+    alike: float = 10.0  # differences of the criterion that do not tell causes apart
+    fitted: int = 8  # explanations by one more cause that are fitted to all records
+    checked: int = 4  # explanations that are tried in closed loop
+    executions: int = 8  # that are explained at most
+    failed: int = 4  # executions among them that failed
+    away: float = 30.0  # ranges of the states that M predicted, beyond which a failed execution says nothing of M
+    steps: int = 5  # of a failed execution
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +62,8 @@ class Predicted(ShortRepr):
 class ClosedLoops:
     """Executions, their deviations and distances from the loops on M, and closed loops on models with causes."""
 
-    def __init__(self, validation: Validation, executions: Sequence[ExecutedTask]) -> None:
-        self.validation, self.executions = validation, executions
+    def __init__(self, validation: Validation, executions: Sequence[ExecutedTask], draws: int = 12) -> None:
+        self.validation, self.executions, self.draws = validation, executions, draws
         whole = [np.concatenate([getattr(each.executed, name) for each in executions]) for name in ("states", "inputs")]
         self.ranges, self.efforts = (np.maximum(np.ptp(values, axis=0), 1e-12) for values in whole)
         pairs = [(each, each.plan.model_trajectory.first(each.executed.horizon)) for each in executions]
@@ -106,7 +111,7 @@ class ClosedLoops:
         if not noise.any():
             return []
         plan, start = execution.plan, execution.executed.states[0]
-        drawn = noise * np.random.default_rng(0).standard_normal((plan.task.horizon + 1, _DRAWS, len(noise)))
+        drawn = noise * np.random.default_rng(0).standard_normal((plan.task.horizon + 1, self.draws, len(noise)))
 
         def of(draws: int | slice) -> Trajectory:
             initial = np.broadcast_to(start, drawn[0, draws].shape)
@@ -119,8 +124,8 @@ class ClosedLoops:
             with contextlib.suppress(Exception):  # a controller that takes no batch
                 together = of(slice(None))
                 if np.allclose(together.states[0], first.states, rtol=1e-6, atol=1e-9 * float(self.ranges.max())):
-                    loops = [together[k] for k in range(_DRAWS)]
-            loops = loops or [first, *(of(k) for k in range(1, _DRAWS))]
+                    loops = [together[k] for k in range(self.draws)]
+            loops = loops or [first, *(of(k) for k in range(1, self.draws))]
         return loops if all(loop.finite.all() for loop in loops) else []
 
     def _deviation(self, executed: Trajectory, loop: Trajectory) -> float:
@@ -138,7 +143,7 @@ class ClosedLoops:
         return np.inf
 
 
-def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
+def find_causes(campaign: Campaign, *, most: int = 2, settings: CauseSettings = CauseSettings()) -> CauseReport:
     """Return what M lacks, found in the executions of a campaign. Nothing is executed.
 
     Every cause of the dictionary is fitted alone, and then each beside the best one. The Bayesian information criterion
@@ -148,6 +153,7 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
 
     Args:
         most: the largest number of causes together.
+        settings: how many causes are tried, and what they must explain.
 
     Raises:
         InputError: if there are fewer than two executions with trajectories, or if they do not say enough.
@@ -157,13 +163,13 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
     failed = list[tuple[Trial, Trajectory]]()
     for trial in campaign.failed if validation.outputs is None else ():
         nominal, run = campaign.trajectories(trial)
-        if nominal is not None and run is not None and len(failed) < _FAILED:
+        if nominal is not None and run is not None and len(failed) < settings.failed:
             # What was recorded until the system left the surroundings of what M promised.
-            far = np.abs(run.states - nominal.states[0]) > _AWAY * np.ptp(nominal.states, axis=0).clip(1e-12)
+            far = np.abs(run.states - nominal.states[0]) > settings.away * np.ptp(nominal.states, axis=0).clip(1e-12)
             steps = min([run.horizon, *(np.flatnonzero(far.any(axis=1))[:1] - 1)])
-            if steps >= _STEPS:
+            if steps >= settings.steps:
                 failed.append((trial, run.first(steps)))
-    trials = failed + trials[: 8 - len(failed)]  # those with the largest distances
+    trials = failed + trials[: settings.executions - len(failed)]  # those with the largest distances
     if len(trials) < 2:
         raise InputError(
             f"causes need at least 2 executions with trajectories in the store, got {len(trials)}; `ctxval run` with "
@@ -180,12 +186,15 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
             states = estimated
         plan = validation.plan
         executions = [ExecutedTask(plan(validation.space.from_unit(point)), run) for point, run in executed]
-        return replace(_Study(validation, executions, states).report(most), failed=len(failed))
+        return replace(_Study(validation, executions, states, settings).report(most), failed=len(failed))
 
 
 class _Study:
-    def __init__(self, validation: Validation, executions: list[ExecutedTask], runs: list[Trajectory]) -> None:
+    def __init__(
+        self, validation: Validation, executions: list[ExecutedTask], runs: list[Trajectory], settings: CauseSettings
+    ) -> None:
         self.validation, self.executions, self.model = validation, executions, validation.model
+        self.settings = settings
         self.outputs = validation.outputs is not None
         horizon = min(len(run.inputs) for run in runs)
         # What inputs and jumps of the records tell is known, and not fitted.
@@ -196,12 +205,13 @@ class _Study:
         self.known = (*late, *signals.wrapped_angles([run.states for run in runs], following))
         known = tuple(each.cause for each in self.known)
         # Estimated states are worth little in one step.
-        steps = (max(1, horizon // 60), max(1, horizon // 12)) if self.outputs else STEPS
-        self.evidence = Evidence(self.model, runs, steps=steps, known=known)
+        long = EvidenceSettings((max(1, horizon // 60), max(1, horizon // 12)))
+        taken = long if self.outputs else EvidenceSettings()
+        self.evidence = Evidence(self.model, runs, settings=taken, known=known)
         floors = [window.floors for window in self.evidence.windows]
-        self.some = Evidence(self.model, runs, floors, (200, 40), steps, known)  # all causes are screened on these
+        self.some = Evidence(self.model, runs, floors, (200, 40), taken, known)  # all causes are screened on these
         without = (runs[:k] + runs[k + 1 :] for k in range(len(runs)))
-        self.others = [Evidence(self.model, rest, floors, steps=steps, known=known) for rest in without]
+        self.others = [Evidence(self.model, rest, floors, settings=taken, known=known) for rest in without]
         x, u, residuals = self.evidence.pairs
         usable = np.isfinite(residuals).all(axis=1)
         if not usable.any():
@@ -217,7 +227,7 @@ class _Study:
         if self.known or not self.outputs:
             known = Repaired(self.model, tuple(each.cause for each in self.known))
             first = self._in_closed_loop(Explanation(self.known, known, 0.0, 1.0))
-        if first is not None and first.complete >= _NAMED:
+        if first is not None and first.complete >= self.settings.named:
             if self.known:
                 return self._reported([first], [], False)
             offset = self._offset_of_starts()
@@ -235,7 +245,7 @@ class _Study:
                     better, others = self._chosen(self._ranked(self._fitted(better)[1:]))
                 if better is None or not better.counts(self.before):
                     break
-                if better.explanation.criterion > chosen.explanation.criterion - _ALIKE:
+                if better.explanation.criterion > chosen.explanation.criterion - self.settings.alike:
                     break
                 if 1 - better.complete > 0.5 * (1 - chosen.complete):
                     break
@@ -248,7 +258,7 @@ class _Study:
         return chosen.explanation.candidates[len(self.known) :]
 
     def _reported(self, group: list[Explained], ranked: list[Explanation], began_elsewhere: bool) -> CauseReport:
-        named = bool(group) and group[0].counts(self.before) and group[0].complete >= _NAMED
+        named = bool(group) and group[0].counts(self.before) and group[0].complete >= self.settings.named
         is_measured = group and not self.outputs and not began_elsewhere
         from_tasks = self.loops.distance_from_tasks(group[0].explanation.repaired) if is_measured else None
         return CauseReport(
@@ -289,7 +299,7 @@ class _Study:
             advance(1)
         results.sort(key=lambda result: result[0])
         # What comes to less than a quarter of the evidence of the best one is not worth a fit.
-        worth = [result for result in results[:_FITTED] if result[0] <= 0.25 * results[0][0]]
+        worth = [result for result in results[: self.settings.fitted] if result[0] <= 0.25 * results[0][0]]
         refined = [explained(self.evidence, together, begun) for _, begun, together in worth or results[:1]]
         distinct = list[Explanation]()
         for explanation in sorted(refined, key=lambda each: each.criterion):
@@ -304,21 +314,22 @@ class _Study:
         no other explanation. If none counts, it is the one that explains most, if this is not little.
         """
         tried = list[Explained]()
-        for each in ranked[:_CHECKED]:
+        for each in ranked[: self.settings.checked]:
             tried.append(self._in_closed_loop(each))
             if tried[-1].counts(self.before):
                 break
         else:
             most = max(tried, key=lambda each: each.share)
-            return (most if most.resolved and most.share > _LITTLE else None), []
+            return (most if most.resolved and most.share > self.settings.little else None), []
         best = tried[-1]
         # Of residuals that are nearly explained, differences by a third may be the way of integration.
         left, most_probable = best.explanation.left, best.explanation.criterion
         most_left = 1.3 * left + 2e-4 if left < 0.02 else -np.inf
-        alike = [each for each in ranked if each.criterion < most_probable + _ALIKE or each.left < most_left]
+        least = most_probable + self.settings.alike
+        alike = [each for each in ranked if each.criterion < least or each.left < most_left]
         others = [each for each in alike if each is not best.explanation]
         others.sort(key=lambda each: len(each.sizes))  # the simplest are tried first
-        group = [best, *(self._in_closed_loop(each) for each in others[:_CHECKED])]
+        group = [best, *(self._in_closed_loop(each) for each in others[: self.settings.checked])]
         group = [each for each in group if 1 - each.share <= 2 * (1 - best.share) + 1e-3]
         first = min((each for each in group if each.counts(self.before)), key=lambda each: len(each.explanation.sizes))
         return first, [each for each in group if each is not first and not _contains(each, first)]

@@ -12,8 +12,6 @@ from ctxval._util.representation import ShortRepr, call, line, lines, task_text
 from ctxval.studies.causes.cause import Cause, Plant, Repaired
 from ctxval.studies.causes.evidence import Explanation
 
-_APART = 0.1  # share of the largest distance from M which starts elsewhere must cause, to be remarked
-
 
 @dataclass(frozen=True, eq=False)
 class Explained(ShortRepr):
@@ -112,7 +110,8 @@ class CauseReport(ShortRepr):
             f"the largest distance of {self.executions} executions{failed} "
             f"{'falls' if falls else 'rises'} from {self.before:.3g} to {first.distance:.3g}{units}"
         )
-        if self.from_tasks is not None and self.from_tasks > max(2 * first.distance, _APART * self.before):
+        # A share of the distance from M that is worth a remark.
+        if self.from_tasks is not None and self.from_tasks > max(2 * first.distance, 0.1 * self.before):
             effect += ", predicted from where the executions began; from where their tasks begin, it is "
             effect += f"{self.from_tasks:.3g}{units}"
         part, of = (first.share, "deviations") if first.resolved else (first.structure, "residuals, except for noise")
