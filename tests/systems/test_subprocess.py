@@ -389,14 +389,13 @@ def test_the_process_itself_adopts_nobody(tmp_path: Path) -> None:
 @pytest.mark.slow
 @LINUX
 @pytest.mark.parametrize("signal_", ["SIGKILL", "SIGSTOP"])
-def test_a_supervisor_that_is_killed_or_stopped_takes_its_command_with_it(
-    signal_: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(supervised, "_GRACE_PERIOD", 0.2)
+def test_a_supervisor_that_is_killed_or_stopped_takes_its_command_with_it(signal_: str, tmp_path: Path) -> None:
     # Whoever watches has time to say which process it started, also on a busy computer.
     code = SPAWN + f"import os, signal; time.sleep(0.5); os.kill(os.getppid(), signal.{signal_}); time.sleep(60)"
+    rig = python(tmp_path, code, str(tmp_path), timeout=2)
+    rig.patience = 0.2
     with pytest.raises(ExecutionError, match=r"the process that watches the command was killed|did not end within 2 s"):
-        python(tmp_path, code, str(tmp_path), timeout=2).execute(designed(), TASK)
+        rig.execute(designed(), TASK)
     assert gone(int((tmp_path / "pid").read_text()))
 
 
