@@ -221,7 +221,8 @@ def _evidence(certificate: Certificate, tau: float, quantities: Quantities) -> s
         text += (
             " No tried task exceeds the threshold under a further error of M, beyond what was learned, of up to "
             f"{push_in_words(everywhere)} at every step, or of {push_in_words(away)} where no record is near; the "
-            f"largest error of M{beside} in the records, which was learned, is {_rate(everywhere.state, everywhere.residual)}."
+            f"largest error of M{beside} in the records, which was learned, is "
+            f"{_rate(everywhere.state, everywhere.residual)}."
         )
     if (pocket := details.get("unvisited_region")) is not None:
         text += (
