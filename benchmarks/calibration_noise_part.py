@@ -31,10 +31,10 @@ The posterior samples alone, without tests and diagnostics, give bounds of which
 {coverage}
 
 Noisy dynamics predict, before each execution, the probability of a smaller distance. If the law is right, these
-probabilities are uniform at drawn tests. The probability of ranks that are less uniform is {uniform}. After
-measurement noise, distances are more rarely far above the prediction than they should be, so its predictions err on
-the safe side. Tasks that were chosen because a large distance was predicted fall into the lowest tenth too often, by
-a factor of {lowest}, as a choice by its prediction implies.
+probabilities are uniform at drawn tests. The p-values of a chi-squared test are: {uniform}. After measurement noise,
+distances are more rarely far above the prediction than they should be, so its predictions err on the safe side.
+Tasks that were chosen for their large prediction fall into the lowest tenth too often, as expected of such a choice:
+by a factor of {lowest}.
 
 ![How often each tenth of the predicted probabilities was met, and its range by chance](calibration/noise_ranks.png)
 

@@ -218,7 +218,7 @@ def summary() -> str:
             calibration_verdicts_part.false_of(calibration_verdicts_part.reported_false()),
             "-",
         ],
-        ["dynamics other in some tasks (chosen to be hard)", calibration_strangers_part.false_of_drawn(), "-"],
+        ["different dynamics in some tasks (chosen to be hard)", calibration_strangers_part.false_of_drawn(), "-"],
         ["carts that break an assumption", calibration_noise_part.false_of("misleading"), "-"],
     ]
     return table(["campaigns", "0.95 d*: validated, which is false", "validated above d*"], rows)
@@ -290,8 +290,9 @@ confidence 97.5 % (Clopper and Pearson).
 
 {summary}
 
-A verdict is false most often if the dynamics are other in few tasks, or in a small place, and no execution met them:
-no number of executions excludes this, and the verdict says which share of the tasks its tests alone support.
+Most false verdicts are on systems whose dynamics differ in few tasks, or in a small place, that no execution has
+met. No number of executions excludes this. The verdict therefore states the share of the tasks that its tests alone
+support.
 
 {strangers}
 
@@ -309,8 +310,8 @@ confidence: its 95 % interval lies below the stated one in {too_low} of {exact_c
 {too_high} ([table](tables/calibration-exact.csv)).
 
 **As used in practice**, the bound is no smoother than the best-spread trials suggest (`spread_share` in
-`gp/hyperposterior.py`), because real distances are no draws from the prior. The table has the lowest coverage at 95
-% over the numbers of executions, before the diagnosis withdraws bounds; (k/n) are k bounds of n that are too low,
+`gp/hyperposterior.py`), because real distances are no draws from the prior. The table has the lowest coverage at
+95 % over the numbers of executions, before the diagnosis withdraws bounds; (k/n) are k bounds of n that are too low,
 and bold entries are significantly below 95 % (binomial test at 1 %).
 
 {lowest}

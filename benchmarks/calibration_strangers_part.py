@@ -29,9 +29,9 @@ validations](tables/calibration-strangers-false.csv).
 
 ### Tests at drawn tasks
 
-Do tests meet dynamics that are other in some tasks or places? `met` is the percentage of drawn sets of eight tests
-of which one meets such a task, without a campaign; in parentheses for independent draws in place of a hypercube. The
-campaigns (`make drawn-tests`) have thresholds of 0.95 d*, so each validation is false: {drawn} were. The systems
+These systems have different dynamics in some tasks or places. `met` is the percentage of sets of eight tests, drawn
+without a campaign, that have a test in such a task; in parentheses, of independent draws in place of a hypercube.
+The campaigns (`make drawn-tests`) have thresholds of 0.95 d*, so each validation is false: {drawn} were. The systems
 belong to the development half.
 
 {power}
@@ -41,7 +41,7 @@ belong to the development half.
 ### Validations that each diagnostic prevented
 
 At {steps} steps of {campaigns} campaigns with a threshold below d*, the bound from learned dynamics was below the
-threshold, and only diagnostics prevented a validation. These were alone in this at some step:
+threshold, and only diagnostics prevented a validation. Each of these was the only obstacle at some step:
 
 {diagnostics}
 

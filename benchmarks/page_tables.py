@@ -63,12 +63,9 @@ def _is_kept(block: str) -> bool:
 def _filled(block: str) -> str:
     indent = " " * len(match[0]) if (match := re.match(r"- |\d+\. ", block)) else ""
     end = "\n" if block.endswith("\n") else ""
-    return (
-        textwrap.fill(
-            " ".join(block.split()), 120, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
-        )
-        + end
-    )
+    kept = re.sub(r"`[^`]+`|\$[^$]+\$|\d %", lambda found: found[0].replace(" ", "\0"), " ".join(block.split()))
+    filled = textwrap.fill(kept, 120, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    return filled.replace("\0", " ") + end
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

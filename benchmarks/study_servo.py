@@ -1,7 +1,7 @@
 """A real servo: what campaigns on its 16 recorded closed loops find, for each published friction model.
 
 ``python benchmarks/study_servo.py`` runs what is not stored yet. Each campaign sees one recording at a time; the
-others judge it. Comparisons of the models see one at a time too. Refinements learn from half of the recordings, and
+others judge it. Refinements learn from half of the recordings, and
 the other half judges them. docs/servo.md is written from the results by ``servo_page.py``. The recordings lie in the
 folder ``bam_xl330`` of the one that CTXVAL_DATA names, or of ``../shared/data``.
 """
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from calibrate import RESULTS, all_of
-from ctxval import Campaign, Task, TaskSuite, Trajectory, Validation, compare, refine, searches
+from ctxval import Campaign, Task, TaskSuite, Trajectory, Validation, refine, searches
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import CertificateOptions, WholeSuite
@@ -37,14 +37,12 @@ PAIRS = ("sin_sin-200,lift_and_drop-800", "up_and_down-400,sin_time_square-800",
 MODELS = tuple(servo.PUBLISHED)
 FITTED = tuple(f"{friction} {pair}" for friction in ("m1", "m4") for pair in PAIRS)
 SHOWN = (*MODELS, f"m4 {PAIRS[0]}")
-COMPARED = (("m4", f"m4 {PAIRS[0]}"), ("m1", "m4"))
-SHARES, SEEDS, COMPARISONS = (1.1, 0.9), 10, 1
+SHARES, SEEDS = (1.1, 0.9), 10
 REFINED, OF_EIGHT = ("m1", "m4"), 0.9  # the threshold of a refinement, as a share of the largest of the eight distances
 
 STORED = JsonLines(RESULTS / "servo.jsonl", ("model", "share", "seed"))
 DISTANCES = JsonLines(RESULTS / "servo_distances.jsonl", ("model",))
 REFINED_STORED = JsonLines(RESULTS / "servo_refined.jsonl", ("model", "half"))
-COMPARED_STORED = JsonLines(RESULTS / "servo_comparisons.jsonl", ("models", "seed"))
 
 Run = tuple[str, float, int]
 
@@ -104,22 +102,6 @@ def of_model(model: str) -> dict[str, Any]:
     assert isinstance(tasks, TaskSuite)
     named = zip(tasks.task_names, all_distances(model), all_distances(model, rms=True), strict=True)
     return {"model": model, "distances": {name: [float(largest), float(rms)] for name, largest, rms in named}}
-
-
-def comparison(run: tuple[str, int]) -> dict[str, Any]:
-    """Return what a comparison of two models by d* decides, and after how many executions."""
-    (models, seed), started = run, time.process_time()
-    with single_threaded():
-        found = compare({one: validation(one) for one in models.split(" / ")}, question="worst", budget=16, seed=seed)
-    (pair,) = found.pairs
-    return {
-        "models": models,
-        "seed": seed,
-        "executions": found.executions,
-        "smaller": pair.smaller,
-        "reason": pair.reason,
-        "seconds": round(time.process_time() - started, 1),
-    }
 
 
 def half(number: int) -> TaskSuite:
@@ -185,9 +167,6 @@ def main() -> None:
     for run in [(model, number) for model in REFINED for number in (0, 1)]:
         if run not in REFINED_STORED:
             REFINED_STORED.append(refined(run))
-    asked = [(" / ".join(pair), seed) for pair in COMPARED for seed in range(min(options.seeds, COMPARISONS))]
-    for result in all_of(comparison, [run for run in asked if run not in COMPARED_STORED], options.workers):
-        COMPARED_STORED.append(result)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,10 @@ from pathlib import Path
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+from source_counts import numeric_constants
+
 SOURCE = Path(__file__).parents[1] / "src" / "ctxval"
 ARCHITECTURE = Path(__file__).parents[1] / "docs" / "architecture.md"
 
@@ -28,6 +32,7 @@ CONTROL = {
         "experiment",
     )
 }
+CONSTANTS = 157  # numbers in capitals that are no settings: tolerances of rounding, formats, layouts; never more
 READ_ONLY = ("campaign.plot", "report")
 EXECUTING = {"execute", "run", "ask", "tell", "outcome", "distances", "plan"}
 
@@ -149,3 +154,23 @@ def test_the_help_loads_no_command_and_nothing_that_computes() -> None:
 def test_tasks_validations_and_stores_are_there_without_the_parts_of_scipy() -> None:
     loaded = loaded_by("from ctxval import Experiment, Store, Task, TaskSpace, Trajectory, Validation")
     assert not loaded & {"scipy.linalg", "scipy.optimize", "scipy.spatial", "scipy.special"}
+
+
+def test_numbers_that_decide_are_settings() -> None:
+    assert sum(len(numeric_constants(path.read_text())) for path in SOURCE.rglob("*.py")) <= CONSTANTS
+
+
+def test_numbers_tuples_and_arrays_are_constants_and_fields_of_settings_are_not() -> None:
+    text = """
+import numpy as np
+A = -1.0
+B: float = 2 * 3**2
+_C, _D = 1, (0.5, [2])
+E = np.linspace(0.0, 1.0, 21)
+F = "text"
+G = True
+H = Settings(3)
+class Settings:
+    I = 4
+"""
+    assert numeric_constants(text) == ["A", "B", "_C", "_D", "E"]

@@ -116,12 +116,9 @@ def expect(expected: float) -> None:
         current.report()
 
 
-_DELAY = 0.4  # seconds before a stage is shown; most end sooner
-
-
 @contextmanager
-def progress_shown(wanted: bool | None = None, console: Console | None = None) -> Iterator[None]:
-    """Show the progress of everything within this context on standard error."""
+def progress_shown(wanted: bool | None = None, console: Console | None = None, delay: float = 0.4) -> Iterator[None]:
+    """Show the progress of everything within this context on standard error, of stages after some seconds."""
     if _innermost.get() is not None and wanted is not False:
         yield
         return
@@ -135,7 +132,7 @@ def progress_shown(wanted: bool | None = None, console: Console | None = None) -
     from rich.console import Console  # slow to load, and needed by few programs
 
     screen = Console(stderr=True, markup=False, emoji=False, highlight=False) if console is None else console
-    with listening(OnScreen(screen) if screen.is_terminal or screen.is_jupyter else InLog(screen)):
+    with listening(OnScreen(screen, delay) if screen.is_terminal or screen.is_jupyter else InLog(screen)):
         yield
 
 
@@ -159,15 +156,15 @@ class InLog:
 
 
 class OnScreen:
-    """Shows one bar for each stage while it lasts. Notes stay on the screen, one line for each."""
+    """Shows one bar for each stage that lasts longer. Notes stay on the screen, one line for each."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, delay: float) -> None:
         from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
         from rich.progress import Progress as Bars
 
         class Delayed(Bars):
             def get_renderables(self) -> Iterable[RenderableType]:
-                yield self.make_tasks_table([task for task in self.tasks if (task.elapsed or 0.0) > _DELAY])
+                yield self.make_tasks_table([task for task in self.tasks if (task.elapsed or 0.0) > delay])
 
         name, amount = (TextColumn(f"{{task.{part}}}", markup=False) for part in ("description", "fields[text]"))
         columns = name, BarColumn(bar_width=20), amount, TimeElapsedColumn()

@@ -17,6 +17,7 @@ from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,9 +30,6 @@ from ctxval._util.files import MOST_BYTES, open_regular
 from ctxval._util.refusals import reworded
 from ctxval._util.texts import number_in, unguarded
 from ctxval.errors import InputError
-
-MOST_ROW = 2**20  # largest number of characters in a row
-_HEAD = 80  # number of lines in which the header is looked for, if they have less than MOST_ROW characters
 
 _SEPARATORS = ("\t", ";", ",", "|", " ")  # the first of those that split most rows alike; a blank stands for several
 _MARKS = (
@@ -67,6 +65,15 @@ class _Layout(NamedTuple):
     skipped: tuple[list[str], ...]  #: the header and the row of units, which loggers repeat
 
 
+@dataclass(frozen=True)
+class TableLimits:
+    """What tables of strangers may hold, so that reading them takes bounded memory and time."""
+
+    numbers: int = MOST_BYTES  # bytes of all numbers
+    row: int = 2**20  # characters in a row
+    head: int = 80  # lines in which the header is looked for, if they have less than half as many characters
+
+
 class CsvTable:
     """The cells of a CSV file of at most so many bytes, and the names of its columns, empty ones where it has none.
 
@@ -74,12 +81,14 @@ class CsvTable:
     counts; else lines that begin with # or %, repeated headers and lines without numbers at the end are left out.
     """
 
+    limits = TableLimits()
+
     def __init__(self, path: str | Path, most: int = MOST_BYTES, *, plain: bool = False) -> None:
         self.path, self._most, self._plain = path, most, plain
         self._marks: dict[str, int] = {}
         self.remarks: list[str] = []  #: what was left out, one sentence each, after the rows were read
         with self._lines() as lines:
-            self._layout = _layout(list(_first(lines)), plain)
+            self._layout = _layout(list(_first(lines, self.limits)), plain)
         self.names = self._layout.names
         require_distinct(str(path), self.names)
 
@@ -123,8 +132,8 @@ class CsvTable:
                 raise wrong
             if most is not None and count > most:
                 raise InputError(f"{self.path} must have {most} rows below its header, and has more.")
-            if 8 * len(names) * count > MOST_BYTES:
-                raise InputError(f"{self.path} has too many numbers: {MOST_BYTES} bytes may be read.")
+            if 8 * len(names) * count > self.limits.numbers:
+                raise InputError(f"{self.path} has too many numbers: {self.limits.numbers} bytes may be read.")
             for name, numbers in columns.items():
                 cell = row[places[name]]
                 try:
@@ -199,22 +208,22 @@ class CsvTable:
             encoding = wide.get(first, "utf-16-le" if first[1:] == b"\0" and first[:1] != b"\0" else "utf-8-sig")
             errors = "ctxval-western" if encoding == "utf-8-sig" else "strict"
             with io.TextIOWrapper(file, encoding=encoding, errors=errors, newline="") as text:
-                yield _Lines(text, self._most)
+                yield _Lines(text, self._most, self.limits.row)
 
 
 class _Lines(Iterator[str]):
     """The lines of a text, of which only so many characters are read, in the whole and in one row."""
 
-    def __init__(self, text: io.TextIOWrapper, most: int) -> None:
-        self._text, self._left, self.in_row = text, most, 0
+    def __init__(self, text: io.TextIOWrapper, most: int, most_in_row: int) -> None:
+        self._text, self._left, self._most_in_row, self.in_row = text, most, most_in_row, 0
 
     def __next__(self) -> str:
-        if not (line := self._text.readline(MOST_ROW + 1)):
+        if not (line := self._text.readline(self._most_in_row + 1)):
             raise StopIteration
         self.in_row += len(line)
         self._left -= len(line)
-        if self.in_row > MOST_ROW:
-            raise InputError(f"it has a row of more than {MOST_ROW} characters")
+        if self.in_row > self._most_in_row:
+            raise InputError(f"it has a row of more than {self._most_in_row} characters")
         if self._left < 0:
             raise InputError("it grew while it was read")
         if "\0" in line:
@@ -227,11 +236,11 @@ class _Lines(Iterator[str]):
 _Row = tuple[int, list[str], bool]  # the number of its last line, its cells, and whether it is a comment
 
 
-def _first(lines: _Lines) -> Iterator[str]:
+def _first(lines: _Lines, limits: TableLimits) -> Iterator[str]:
     """Yield the first lines; the first rows of a wide table are fewer."""
-    for line in itertools.islice(lines, _HEAD):
+    for line in itertools.islice(lines, limits.head):
         yield line
-        if lines.in_row > MOST_ROW // 2:
+        if lines.in_row > limits.row // 2:
             return
 
 

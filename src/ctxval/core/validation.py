@@ -34,8 +34,6 @@ from ctxval.errors import CtxvalError, DesignError, DistanceError, ExecutionErro
 
 START = 0.05  # default start tolerance, as a fraction of the range of each state in the trajectory of the model
 
-_LONG = 100_000  # horizon from which on the cost of a plan is stated before the first one
-
 
 class CostWarning(UserWarning):
     """A plan, or a search for d*, needs much time and memory."""
@@ -66,6 +64,8 @@ class Validation:
     finite, an ExecutionError if the system fails or its result is not an execution of the task, and a DistanceError if
     the distance fails or is not a finite number >= 0.
     """
+
+    cost_stated_from = 100_000  # horizon from which on the cost of a plan is stated before the first one
 
     def __init__(
         self,
@@ -349,7 +349,7 @@ class Validation:
         if not isinstance(task, Task):
             raise InputError(f"the task function's result must be a Task, got {task!r}.")
         require_time_step(self.model, task.dt, "the task")
-        if task.horizon > self.longest or (task.horizon > _LONG and self not in _stated):
+        if task.horizon > self.longest or (task.horizon > self.cost_stated_from and self not in _stated):
             self._state_cost(parameters, task)
         return task if self.space.members is None else task.named(self.space.task_names_at(parameters.points))
 

@@ -25,7 +25,6 @@ from ctxval.errors import InputError
 
 LISTED = 24  #: largest number of fields that a message names
 
-_MOST_MEMORY = 2**30  # largest size of the numbers of messages in bytes; each message needs 256 bytes more
 
 Located = TypeVar("Located")
 
@@ -272,8 +271,18 @@ class Message(ShortRepr):
     content: Any  #: nested mappings and lists
 
 
+@dataclass(frozen=True)
+class MessageLimits:
+    """What logs of messages may hold, so that reading them takes bounded memory."""
+
+    numbers: int = 2**30  # bytes of the numbers of messages; each message needs 256 bytes more
+    chunk: int = 128 * 2**20  # bytes of a record, and of a chunk of records after it is decompressed
+
+
 class TopicLog(Log):
     """A log of messages on topics; a field is ``/topic.field.part[2]``."""
+
+    limits = MessageLimits()
 
     @abstractmethod
     def topics(self) -> tuple[str, ...]:
@@ -303,8 +312,10 @@ class TopicLog(Log):
             stamps = {"log": message.logged, "publish": message.published, "header": _header(message.content)}
             of_topic.append((stamps, values))
             size += sum(256 + value.nbytes for value in values.values())
-            if size > _MOST_MEMORY:
-                raise InputError(f"{self.source} has too many numbers: {_MOST_MEMORY} bytes of memory may be used.")
+            if size > self.limits.numbers:
+                raise InputError(
+                    f"{self.source} has too many numbers: {self.limits.numbers} bytes of memory may be used."
+                )
         for of_topic in records.values():
             of_topic.sort(key=lambda record: record[0]["log"])
         all_stamps = {topic: [stamps for stamps, _ in of_topic] for topic, of_topic in records.items()}

@@ -32,7 +32,6 @@ Decoder = Callable[[bytes], Any]  #: A function that decodes the bytes of one me
 Definition = tuple[Callable[[str, bytes], Decoder], str, bytes]
 """A function that makes a decoder, and its arguments: the name of a type of messages, and the text that defines it."""
 
-_MOST_CHUNK = 128 * 2**20  # largest size of a record, and of a chunk of records after it is decompressed, in bytes
 
 _library = partial(require_extra, extra="logs", needs="logs of messages need")
 
@@ -94,12 +93,12 @@ class McapLog(_FileOfMessages):
     def _records(self, file: Any) -> Iterator[Any]:
         """Yield the records from a place in the file on, and those within chunks, whose sizes are limited."""
         library, ended = _library("mcap.stream_reader"), _library("mcap.exceptions").EndOfFile
-        inside = {"skip_magic": file.tell() > 0, "emit_chunks": True, "record_size_limit": _MOST_CHUNK}
+        inside = {"skip_magic": file.tell() > 0, "emit_chunks": True, "record_size_limit": self.limits.chunk}
         for record in library.StreamReader(file, **inside).records:
             if type(record).__name__ != "Chunk":
                 yield record
                 continue
-            chunk = io.BytesIO(_decompressed(record.compression, record.data))
+            chunk = io.BytesIO(_decompressed(record.compression, self.limits.chunk, record.data))
             if record.uncompressed_crc not in (0, zlib.crc32(chunk.getbuffer())):
                 raise ValueError("a chunk has another checksum")
             with suppress(ended):  # a chunk has no record that says where it ends
@@ -149,7 +148,7 @@ class BagLog(_FileOfMessages):
             reader.open()
             for place, chunk in getattr(reader, "chunks", {}).items():  # of a bag of ROS 1
                 kind = next((name for name in ("bz2", "lz4") if name in chunk.decompressor.__module__), "")
-                reader.chunks[place] = chunk._replace(decompressor=partial(_decompressed, kind))
+                reader.chunks[place] = chunk._replace(decompressor=partial(_decompressed, kind, self.limits.chunk))
         try:
             yield reader
         finally:
@@ -176,21 +175,21 @@ class BagLog(_FileOfMessages):
         return partial(ros_decoder, aligned=self._version == 2), connection.msgtype, text.encode()
 
 
-def _decompressed(kind: str, data: bytes) -> bytes:
-    """Return the content of a chunk, but no more than may be read: the sizes that a file declares may be wrong."""
+def _decompressed(kind: str, most: int, data: bytes) -> bytes:
+    """Return the content of a chunk of at most so many bytes: the sizes that a file declares may be wrong."""
     match kind:
         case "zstd":
-            content = _library("zstandard").ZstdDecompressor().stream_reader(data).read(_MOST_CHUNK + 1)
+            content = _library("zstandard").ZstdDecompressor().stream_reader(data).read(most + 1)
         case "lz4":
-            content = _library("lz4.frame").LZ4FrameDecompressor().decompress(data, max_length=_MOST_CHUNK + 1)
+            content = _library("lz4.frame").LZ4FrameDecompressor().decompress(data, max_length=most + 1)
         case "bz2":
-            content = bz2.BZ2Decompressor().decompress(data, max_length=_MOST_CHUNK + 1)
+            content = bz2.BZ2Decompressor().decompress(data, max_length=most + 1)
         case "":
             content = data
         case _:
             raise ValueError(f"the compression {kind}")
-    if len(content) > _MOST_CHUNK:
-        raise ValueError(f"a chunk has more than {_MOST_CHUNK} bytes")
+    if len(content) > most:
+        raise ValueError(f"a chunk has more than {most} bytes")
     return bytes(content)
 
 

@@ -22,17 +22,9 @@ from ctxval._util.texts import enumerated
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError
 
-# Correlations from which a pair is judged: one whose names or units say so, and one that the records alone show.
-_NAMED, _UNNAMED = 0.95, 0.99
-_WINDOWS = 16  # least number of windows without overlap
-_MOST = 4000  # largest number of windows that are compared for each length
-
 _TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "days": 86400.0}
 _COUNTS = (400, 500, 1000, 2000, 2048, 4000, 8000, 10_000, *(2**k for k in range(8, 25)))
 
-# Times between two records in seconds that occur: of machines that move, without and with a unit in the header; of
-# processes such as tanks and ovens; and of systems whose names tell nothing.
-_MACHINES, _MACHINES_STATED, _PROCESSES, _ANY = (1e-4, 1.5), (1e-4, 10.0), (1e-2, 9e4), (1e-6, 3600.0)
 
 # Words in names of fields.
 _RATES = "rate rates speed speeds vel velocity velocities omega dq qd gyro twist dot rpm drehzahl geschwindigkeit"
@@ -44,6 +36,20 @@ _RATE = re.compile(
     r"[dvw]([xyzqrsh]|th|theta|phi|psi|alpha|beta|yaw|pitch|roll|pos|angle)|([vw])|(.*)(?:dot|vel|rate|speed)"
 )
 _ACCELERATION = re.compile(r"dd(.+)|(.*)ddot|a([xyz])|acc|(.*)accel|(.*)acceleration")
+
+
+@dataclass(frozen=True)
+class ScaleSettings:
+    """When a recorded rate contradicts its state, and which times between two records occur, in seconds."""
+
+    named: float = 0.95  # correlation from which a pair is judged whose names or units say that it is one
+    unnamed: float = 0.99  # the same, of a pair that the records alone show
+    windows: int = 16  # least number of windows without overlap
+    compared: int = 4000  # largest number of windows that are compared for each length
+    machines: tuple[float, float] = (1e-4, 1.5)  # that move
+    machines_stated: tuple[float, float] = (1e-4, 10.0)  # the same, with a unit in the header
+    processes: tuple[float, float] = (1e-2, 9e4)  # such as tanks and ovens
+    others: tuple[float, float] = (1e-6, 3600.0)  # systems whose names tell nothing
 
 
 @dataclass(frozen=True)
@@ -142,14 +148,16 @@ def words_of(path: str) -> list[str]:
     return re.findall("[a-z]+|[0-9]+", name.casefold())
 
 
-def rate_pairs(runs: Sequence[Trajectory], columns: Sequence[Column], dt: float) -> list[RatePair]:
+def rate_pairs(
+    runs: Sequence[Trajectory], columns: Sequence[Column], dt: float, settings: ScaleSettings = ScaleSettings()
+) -> list[RatePair]:
     """Return the states whose rates are recorded, the states first among the columns."""
     count, steps = sum(not column.of_input for column in columns), sum(run.horizon for run in runs)
     correlation, ratio, window = np.zeros((3, count, len(columns)))
     parts = [_integrated(run) for run in runs]
     longest = max((run.horizon for run in runs), default=0)
-    for length in (2**k for k in range(20) if 2**k <= longest // 2 and _WINDOWS * 2**k <= steps):
-        changes, integrals = _windows(parts, length, max(1, steps // _MOST))
+    for length in (2**k for k in range(20) if 2**k <= longest // 2 and settings.windows * 2**k <= steps):
+        changes, integrals = _windows(parts, length, max(1, steps // settings.compared))
         sizes = changes.std(axis=0)[:, None], dt * integrals.std(axis=0)
         with np.errstate(all="ignore"):
             together = dt * (changes - changes.mean(axis=0)).T @ (integrals - integrals.mean(axis=0)) / len(changes)
@@ -164,7 +172,8 @@ def rate_pairs(runs: Sequence[Trajectory], columns: Sequence[Column], dt: float)
         # A pair of unknown names must be positive, because in an oscillation each state is like the rate of the other.
         orders = columns[i].order, columns[j].order
         unnamed = i != j and not {i, j} & used and None in orders and not columns[j].of_input and ratio[i, j] > 0
-        if abs(correlation[i, j]) >= (_NAMED if (i, j) in named else _UNNAMED) and ((i, j) in named or unnamed):
+        least = settings.named if (i, j) in named else settings.unnamed
+        if abs(correlation[i, j]) >= least and ((i, j) in named or unnamed):
             measured = float(ratio[i, j]), float(correlation[i, j]), float(window[i, j])
             pairs.append(RatePair(columns[i], columns[j], *measured, (i, j) in named))
             used |= {i, j} if unnamed else set()
@@ -268,7 +277,9 @@ def require_scale(
     return notes
 
 
-def _usual_steps(columns: Sequence[Column], pairs: Sequence[RatePair], clock: Clocked) -> tuple[float, float]:
+def _usual_steps(
+    columns: Sequence[Column], pairs: Sequence[RatePair], clock: Clocked, settings: ScaleSettings = ScaleSettings()
+) -> tuple[float, float]:
     """Return the shortest and the longest usual time between two records of such fields, seconds."""
     words = {word for column in columns for word in words_of(column.name)}
     process = not words.isdisjoint(_PROCESS.split())
@@ -277,8 +288,8 @@ def _usual_steps(columns: Sequence[Column], pairs: Sequence[RatePair], clock: Cl
         or not words.isdisjoint(_FORCES.split())
         or (pairs and not process)
     ):
-        return _MACHINES_STATED if clock.in_header else _MACHINES
-    return _PROCESSES if process else _ANY
+        return settings.machines_stated if clock.in_header else settings.machines
+    return settings.processes if process else settings.others
 
 
 def _explanation(pair: RatePair) -> str:

@@ -20,7 +20,6 @@ from ctxval.models.increments import standard_deviations, standardised_pairs
 from ctxval.models.linear import Linear
 
 NEGLIGIBLE = 1e-7  # a residual below this share of the state's typical change is rounding
-_ROUNDINGS = 16  # rounding errors of a state that may add up in one step
 
 
 def epsilons(values: Array) -> Array:
@@ -35,7 +34,8 @@ def floors(states: Array, changes: Array, epsilon: float = 0.0) -> Array:
 
     States that are estimated from outputs are rounded by at least the ``epsilon`` of these.
     """
-    rounding = _ROUNDINGS * np.maximum(epsilons(states), epsilon) * np.abs(states).max(axis=0)
+    # Up to 16 rounding errors of a state may add up in one step.
+    rounding = 16 * np.maximum(epsilons(states), epsilon) * np.abs(states).max(axis=0)
     return np.asarray(np.maximum(NEGLIGIBLE * standard_deviations(changes), rounding))
 
 

@@ -36,8 +36,6 @@ from ctxval.systems.episode import require_one
 
 _PROGRAM = Path(__file__).absolute().with_name("supervisor.py")
 
-_GRACE_PERIOD = 10.0  # seconds that a supervisor has to kill its command before it is killed itself
-
 
 def run_supervised(
     command: Sequence[str],
@@ -46,11 +44,13 @@ def run_supervised(
     stderr: IO[bytes],
     timeout: float,
     grace: float = 0.0,
+    patience: float = 10.0,
 ) -> int | None:
     """Run a command, and end all processes that it started, however this call ends.
 
     A command that must be ended gets SIGTERM, and SIGKILL after ``grace`` seconds. Return the exit status, negative for
-    a signal, or None if the command did not end in time.
+    a signal, or None if the command did not end in time. A supervisor that does not end its command in ``patience``
+    more seconds is killed itself.
     """
     if os.name != "posix":
         # Run a command on a system without process groups; processes that it starts may outlive it.
@@ -92,7 +92,7 @@ def run_supervised(
             raise ExecutionError("the process that watches the command was killed")
         return int(status)
     finally:
-        _end(supervisor, child, grace)
+        _end(supervisor, child, grace + patience)
 
 
 def _readable(stdout: IO[bytes], timeout: float) -> bool:
@@ -101,8 +101,8 @@ def _readable(stdout: IO[bytes], timeout: float) -> bool:
         return bool(selector.select(timeout if timeout < 1e6 else None))  # the system does not take years
 
 
-def _end(supervisor: subprocess.Popen[bytes], child: int, grace: float) -> None:
-    """Make the supervisor end the remaining processes; if it does not, kill it and the command's group."""
+def _end(supervisor: subprocess.Popen[bytes], child: int, seconds: float) -> None:
+    """Make the supervisor end the remaining processes; if it does not in time, kill it and the command's group."""
     assert supervisor.stdin is not None
     assert supervisor.stdout is not None
     with contextlib.suppress(OSError):
@@ -110,7 +110,7 @@ def _end(supervisor: subprocess.Popen[bytes], child: int, grace: float) -> None:
     with contextlib.suppress(OSError):
         supervisor.stdin.close()
     try:
-        supervisor.wait(grace + _GRACE_PERIOD)
+        supervisor.wait(seconds)
     except subprocess.TimeoutExpired:  # e.g. somebody stopped the supervisor by SIGSTOP
         supervisor.kill()
         supervisor.wait()
@@ -147,6 +147,8 @@ class Subprocess:
         keep: a folder in which the folders of all executions are kept, to examine failures.
         folder: folder in which the files that the command names are searched before the current one.
     """
+
+    patience = 10.0  # seconds that a supervisor has to kill its command before it is killed itself
 
     def __init__(
         self,
@@ -200,7 +202,7 @@ class Subprocess:
             # Output goes to files, because a grandchild that keeps a pipe open would make us wait for it.
             with (folder / "stdout.txt").open("wb") as stdout, (folder / "stderr.txt").open("w+b") as stderr:
                 command = [*self._located, str(folder)]
-                status = run_supervised(command, home, stdout, stderr, self.timeout, self.grace)
+                status = run_supervised(command, home, stdout, stderr, self.timeout, self.grace, self.patience)
                 # The file is not opened again, because its name may now stand for another file.
                 stderr.seek(max(0, stderr.seek(0, os.SEEK_END) - 4096))
                 lines = stderr.read().decode("utf-8", "replace").splitlines() if status else []

@@ -23,8 +23,6 @@ from ctxval.errors import CtxvalError, InputError, ModelError
 from ctxval.studies.fitting.fit import part_of
 from ctxval.studies.replay.accuracy import Windows, predicted
 
-_LATER = 10  # steps after which the errors choose corrections
-
 
 @dataclass(frozen=True, eq=False)
 class Records(ShortRepr):
@@ -166,13 +164,13 @@ def _compared(data: Transitions, runs: Sequence[Trajectory], model: Model, befor
     return HeldOut(pairs, errors, first, changes, later[later_usable], later_first[later_usable])
 
 
-def _errors_later(model: Model, runs: Sequence[Trajectory], n: int) -> Array:
-    """Return the errors ``(K, n)`` of a model after ten steps with recorded inputs, from each state that has these."""
-    if not any(run.horizon >= _LATER for run in runs):
+def _errors_later(model: Model, runs: Sequence[Trajectory], n: int, steps: int = 10) -> Array:
+    """Return the errors ``(K, n)`` of a model after some steps with recorded inputs, from each state that has these."""
+    if not any(run.horizon >= steps for run in runs):
         return np.zeros((0, n))
-    where = Windows.of(runs, 0, _LATER, sum(run.horizon for run in runs))
+    where = Windows.of(runs, 0, steps, sum(run.horizon for run in runs))
     with suppress(ModelError):  # users' models, at states that were not recorded
-        return -predicted(model, where, _LATER)[0]
+        return -predicted(model, where, steps)[0]
     return np.full((len(where), n), np.nan)
 
 
