@@ -151,6 +151,7 @@ drawn-tests: .venv/.test  ## do tests at drawn tasks keep verdicts from lifts an
 	$(BIN)/python benchmarks/study_drawn_tests.py
 
 parts: .venv/.test  ## the parts and the commands; writes docs/parts.md and docs/reference/command-line.md
+	$(BIN)/python benchmarks/checks_page.py
 	$(BIN)/python benchmarks/parts_page.py
 	$(BIN)/python benchmarks/command_line_page.py
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,6 @@ from calibrate import RESULTS, all_of
 from ctxval import Campaign, Validation
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
-from ctxval.certificates.dynamics import bound_of
 from ctxval.core.quantiles import LEVELS
 from noise_development import PLANTS as DEVELOPMENT
 from noise_misleading import PLANTS as MISLEADING
@@ -107,7 +107,7 @@ def _bounds(campaign: Campaign, largest: float) -> dict[str, float] | None:
     if evidence is None:
         return None
     best = max((trial.distance or 0.0 for trial in campaign.trials), default=0.0)
-    return {str(each): bound_of(evidence, best, each) / largest for each in CONFIDENCES}
+    return {str(c): replace(evidence, best=best, confidence=c).bound / largest for c in CONFIDENCES}
 
 
 def _ranks(campaign: Campaign) -> list[float]:

@@ -9,60 +9,47 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ctxval import Campaign
-from ctxval.certificates import DynamicsEvidence
-from ctxval.certificates.dynamics import bound_of
-from ctxval.certificates.dynamics_diagnostics import doubts, raised
+from ctxval.certificates import Evidence
+from ctxval.certificates.checks import CHECKS, withdrawals
 from ctxval.core.trial import Trials
 
 CONFIDENCE = 0.95
 FAILED = "a prediction that failed"
 """It withdraws no bound, but raises it."""
 NAMES = {
-    "executed trajectories, and the bound needs": "fewest executions",
-    "no controller can be designed": "tasks without a plan",
-    "were predicted from earlier ones": "fewest predictions",
-    "noise is learned": "noise",
-    "contradict the learned noise": "evidence against the noise",
-    "understate the predictive uncertainty": "variance left out",
-    "leave the recorded range of": "beyond the records",
-    "predicted runs diverge": "beyond the records",
-    "enter a gap in the records": "gap",
-    "enter a gap in the joint records": "joint gap",
-    "hardly changes the closed loops": "untried parameter",
-    "has a task near the corner": "untried corner",
-    "where predicted runs lead, and a post": "unentered place",
-    "is not tested where it matters": "largest distance untested",
-    "small distances hardly test it": "no large prediction that held",
-    "must be predicted beforehand": "tests missing",
-    "if a task changes by a thousandth": "jumps",
-    "searches of the learned dynamics find": "deeper searches",
+    "few_executions": "fewest executions",
+    "not_planned": "tasks without a plan",
+    "few_predictions": "fewest predictions",
+    "noisy": "noise",
+    "noise_contradicted": "evidence against the noise",
+    "left_out": "variance left out",
+    "beyond": "beyond the records",
+    "diverged": "beyond the records",
+    "pair_gap": "joint gap",
+    "unsampled_parameter": "untried parameter",
+    "unsampled_corner": "untried corner",
+    "unvisited_region": "unentered place",
+    "not_tested": "largest distance untested",
+    "none_held": "no large prediction that held",
+    "tests_missing": "tests missing",
+    "needle": "jumps",
+    "jump": "jumps",
+    "searches_differ": "deeper searches",
 }
-"""Names of the diagnostics, by a phrase of the sentence of each."""
+"""Names of checks in stored results, by their codes, where they differ."""
 
 
-def name_of(sentence: str) -> str:
-    """Return the name of the diagnostic that gives a sentence.
-
-    Raises:
-        ValueError: if none or several do.
-    """
-    names = [name for phrase, name in NAMES.items() if phrase in sentence]
-    if len(names) != 1:
-        raise ValueError(f"one diagnostic gives each sentence, but {names} give: {sentence}")
-    return names[0]
-
-
-def stopping(evidence: DynamicsEvidence, best: float, threshold: float) -> list[str] | None:
-    """Return the names of the diagnostics that stop a validation; None if the bound exceeds the threshold anyway."""
-    bound = bound_of(evidence, best, CONFIDENCE)
-    if max(bound, best) > threshold:
+def stopping(evidence: Evidence, best: float, threshold: float) -> list[str] | None:
+    """Return the names of the checks that stop a validation; None if the bound exceeds the threshold anyway."""
+    judged = replace(evidence, best=best, confidence=CONFIDENCE, threshold=threshold)
+    if max(judged.bound, best) > threshold:
         return None
-    names = [name_of(sentence) for sentence in doubts(evidence, best, bound)]
-    return [*names, FAILED] if raised(evidence, bound) > threshold else names
+    names = [NAMES.get(opened.code, opened.code) for opened in withdrawals(judged)]
+    return [*names, FAILED] if judged.raised > threshold else names
 
 
 @dataclass(frozen=True)
@@ -80,8 +67,8 @@ class JudgedRun:
         dynamics, steps = self.campaign.recorder.dynamics, dict[int, list[str]]()
 
         def watched(judge: Any) -> Any:
-            def judged(trials: Sequence[Any], *args: Any, **options: Any) -> DynamicsEvidence | None:
-                evidence: DynamicsEvidence | None = judge(trials, *args, **options)
+            def judged(trials: Sequence[Any], *args: Any, **options: Any) -> Evidence | None:
+                evidence: Evidence | None = judge(trials, *args, **options)
                 if evidence is not None and not options.get("pending"):
                     by = stopping(evidence, Trials(trials).largest, self.threshold)
                     if by is not None:
@@ -112,6 +99,7 @@ def caught(results: Sequence[dict[str, Any]]) -> list[list[str]]:
         alone.update(single)
         for name in set(single):
             campaigns[name] += 1
-    known = dict.fromkeys([*NAMES.values(), FAILED])
+    withdrawing = (check.code for check in CHECKS if check.stage != "bound")
+    known = dict.fromkeys([*(NAMES.get(code, code) for code in withdrawing), FAILED])
     order = sorted(known, key=lambda name: (-campaigns[name], -alone[name], -spoke[name]))
     return [[name, str(spoke[name]), str(alone[name]), str(campaigns[name])] for name in order]

@@ -25,7 +25,7 @@ from ctxval import Campaign
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.boxes import latin_hypercube
 from ctxval._util.json_lines import JsonLines
-from ctxval.certificates.dynamics_diagnostics import ACCURATE
+from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.prediction_tests import TESTS
 from dynamics_truths import digest
 from strangers import Stranger
@@ -119,7 +119,7 @@ def power(run: tuple[str, int]) -> dict[str, Any]:
     entry, met, failing = DEVELOPMENT[name], {}, {}
     assert entry.without is not None
     validation, plain = entry(seed).validation, entry.without(seed).validation
-    space, limit = validation.space, ACCURATE * SHARE * truth(entry, seed)
+    space, limit = validation.space, LIMITS.error * SHARE * truth(entry, seed)
     for design, drawn in DESIGNS.items():
         rng = np.random.default_rng([seed, 0x6472])
         points = space.from_unit(np.concatenate([drawn(space.dimension, rng) for _ in range(DRAWS)]))

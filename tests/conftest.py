@@ -9,7 +9,7 @@ import shutil
 import signal
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +29,12 @@ from hypothesis import settings
 from ctxval import Task, TaskSpace, Transitions, Validation, controllers, distances, models, systems
 from ctxval.certificates import (
     CheckedPrediction,
-    DynamicsEvidence,
+    Evidence,
+    Learned,
     StateInputCoverage,
     StateInputGap,
 )
+from ctxval.certificates.evidence import Predicted
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
 from ctxval.paper.cases import pendulum
@@ -153,32 +155,24 @@ def make_validation_without_inputs(batched: bool = True) -> Validation:
     )
 
 
-@dataclass(frozen=True)
-class Predicted:
-    """A prediction that is a function of points; it learns nothing from trials, and remembers which it might use."""
+def learned_by(
+    function: Callable[[np.ndarray], np.ndarray], draws: np.ndarray, before: int = 0, count: int = 1000
+) -> Learned:
+    """Return what a prediction that is a function of points says of independent draws ``(n, d)`` and further tasks.
 
-    function: Callable[[np.ndarray], np.ndarray]
-    dimension: int = 1
-    asked: list[int] = field(default_factory=list)
-
-    def expected(self, points: np.ndarray, before: int) -> np.ndarray:
-        self.asked.append(before)
-        return self.function(points)
-
-    def dynamics(self, confidence: float, quantile: float = 0.9) -> DynamicsEvidence:
-        """Return evidence against which no diagnostic speaks, with 2000 draws of d* between 2 and 3."""
-        rng = np.random.default_rng(4)
-        gap = StateInputGap(0.01, ("x[0]",), {"x[0]": 0.0})
-        covered = StateInputCoverage(gap, gap, gap, {"x[0]": 0.1}, rng.random(self.dimension), 99)
-        tasks = [(k / 9,) * self.dimension for k in range(1, 9)]
-        checked = tuple(
-            CheckedPrediction(k, 0.5, 1.0, 1.2, 1.0, origin="spread", point=task) for k, task in enumerate(tasks)
-        )
-        draws, local_maxima = rng.random((2000, self.dimension)), rng.random((3, self.dimension))
-        return DynamicsEvidence(np.linspace(2, 3, 2000), draws, 1.9, local_maxima, 999, 5, 0.0, 0.0, checked, covered)
-
-    def tasks(self, count: int, seed: int) -> np.ndarray:
-        return np.random.default_rng([seed, 9]).random((count, self.dimension))
+    Its evidence opens no check, with 2000 draws of d* between 2 and 3.
+    """
+    rng, d = np.random.default_rng(4), draws.shape[1]
+    gap = StateInputGap(0.01, ("x[0]",), {"x[0]": 0.0})
+    covered = StateInputCoverage(gap, gap, gap, {"x[0]": 0.1}, rng.random(d), 99)
+    tasks = [(k / 9,) * d for k in range(1, 9)]
+    checked = tuple(
+        CheckedPrediction(k, 0.5, 1.0, 1.2, 1.0, origin="spread", point=task) for k, task in enumerate(tasks)
+    )
+    drawn, local_maxima = rng.random((2000, d)), rng.random((3, d))
+    evidence = Evidence(np.linspace(2, 3, 2000), drawn, 1.9, local_maxima, 999, 5, 0.0, 0.0, checked, covered)
+    further = np.random.default_rng([before, 9]).random((count, d))
+    return Learned(evidence, predicted=Predicted(before, function(draws), function(further)))
 
 
 def interrupt_at_once() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctxval.certificates import CheckedPrediction, DynamicsEvidence, StateInputCoverage, StateInputGap
+from ctxval.certificates import CheckedPrediction, Evidence, StateInputCoverage, StateInputGap
 
 
 def prediction(trial: int, median: float = 0.5, distance: float = 0.5) -> CheckedPrediction:
@@ -16,7 +16,7 @@ def gap(size: float, *coordinates: str) -> StateInputGap:
 
 
 COVERED = StateInputCoverage(gap(0.1), gap(0.01), gap(0.2, "x[0]", "u[0]"), {"x[0]": 0.1, "u[0]": 0.2}, np.zeros(2), 99)
-GOOD = DynamicsEvidence(
+GOOD = Evidence(
     maxima=np.linspace(0.9, 1.0, 40),
     points=np.random.default_rng(0).random((40, 2)),
     highest=0.95,
@@ -28,4 +28,6 @@ GOOD = DynamicsEvidence(
     predictions=tuple(prediction(k) for k in range(1, 4)),
     coverage=COVERED,
     tests=0,
+    best=0.8,
+    worst=(0.2, 0.7),
 )

@@ -12,7 +12,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
-from conftest import Predicted, make_validation
+from conftest import learned_by, make_validation
 from ctxval import Campaign, refine, searches, systems
 from ctxval.campaign.dynamics import PREDICTION
 from ctxval.certificates import (
@@ -21,7 +21,7 @@ from ctxval.certificates import (
     Audit,
     CheckedPrediction,
     DistanceBound,
-    DynamicsEvidence,
+    Evidence,
     Region,
     Sample,
     StateInputCoverage,
@@ -102,19 +102,17 @@ def keys(report: Any) -> set[str]:
     return set(report).union(*(keys(value) for value in report.values()))
 
 
-def evidence() -> DynamicsEvidence:
+def evidence() -> Evidence:
     gap = StateInputGap(0.01, ("x[0]",), {"x[0]": 0.0, "u[0]": 1.0})
     coverage = StateInputCoverage(gap, gap, gap, gap.place, np.zeros(1), 9)
     checked = tuple(CheckedPrediction(k, 0.5, 2.0, 2.1, 2.0) for k in range(3))
-    return DynamicsEvidence(
-        np.linspace(2, 3, 40), np.zeros((40, 1)), 2.5, np.zeros((2, 1)), 99, 8, 0, 0, checked, coverage
-    )
+    return Evidence(np.linspace(2, 3, 40), np.zeros((40, 1)), 2.5, np.zeros((2, 1)), 99, 8, 0, 0, checked, coverage)
 
 
 def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
     points = np.linspace(0.05, 0.95, 8)[:, None]
     origins: list[Origin] = ["iid"] * 4 + ["acquisition"] * 4
-    learned = Predicted(lambda p: p[:, 0])
+    learned = learned_by(lambda p: p[:, 0], points[:4])
     sample = Sample(points, np.sin(5 * points[:, 0]) + 2, origins, ["completed"] * 8, learned=learned)
     certificates = [
         Audit().certify(sample),

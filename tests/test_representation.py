@@ -201,8 +201,8 @@ def predicted() -> learning.ExecutionPrediction:
     return found
 
 
-def evidence() -> certificates.DynamicsEvidence:
-    return certificates.DynamicsEvidence(
+def evidence() -> certificates.Evidence:
+    return certificates.Evidence(
         np.linspace(0.9, 1, 40), np.zeros((40, 2)), 0.95, np.zeros((5, 2)), 9000, 4, 0.01, 1e-6, (CHECKED,), COVERED
     )
 
@@ -366,7 +366,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.CertificateOptions": lambda: BY_POSTERIOR,
     "certificates.CheckedPrediction": lambda: CHECKED,
     "certificates.Dynamics": certificates.Dynamics,
-    "certificates.DynamicsEvidence": evidence,
+    "certificates.Evidence": evidence,
     "certificates.Neighbour": lambda: certificates.Neighbour(Path("other.sqlite")),
     "certificates.DistanceBound": certificates.DistanceBound,
     "certificates.Provenance": lambda: certificates.Provenance(remarks=("fuse replaced",)),
@@ -641,7 +641,7 @@ ATTACKS: dict[str, Callable[[], object]] = {
     "trajectory": lambda: Trajectory(TASK.times, np.zeros((26, 2)), np.zeros((25, 1)), HOSTILE),
     "truth": lambda: Truth(1.0, SPACE.parameters([1, 2, 3, 4]), HOSTILE),
     "made good": lambda: certificates.RecoveredFailure(1, 2, HOSTILE),
-    "diagnosis": lambda: certificates.Diagnosis(0.0, 1, 1.0, 1.0, HOSTILE),
+    "diagnosis": lambda: certificates.Diagnosis(0.0, 1, 1.0, 1.0, "far_task", HOSTILE),
     "manual": lambda: systems.Manual(states={"x": HOSTILE}, inputs={}, dt=1.0),
     "command": lambda: systems.Subprocess([sys.executable, HOSTILE], timeout=1.0),
     "model": lambda: models.Function(type(HOSTILE, (), {"__call__": policy})()),

@@ -9,26 +9,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import pytest
-
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-sys.path.insert(0, str(Path(__file__).parents[1] / "certificates"))
-from test_dynamics_diagnostics import BAD
-
 from rig_evidence import GOOD, prediction
-from strangers_diagnostics import FAILED, NAMES, JudgedRun, caught, name_of, stopping
-
-
-def test_each_sentence_has_the_name_of_one_diagnostic() -> None:
-    names = set()
-    for changed, _ in BAD:
-        by = stopping(replace(GOOD, **changed), 0.8, 2.0)
-        assert by
-        names.update(by)
-    assert names <= {*NAMES.values(), FAILED}
-    assert len(names) > 10
-    with pytest.raises(ValueError, match="one diagnostic gives each sentence"):
-        name_of("nothing speaks against it")
+from strangers_diagnostics import FAILED, JudgedRun, caught, stopping
 
 
 def test_nothing_is_stopped_that_is_not_below_the_threshold() -> None:
@@ -78,4 +61,4 @@ def test_a_diagnostic_that_alone_stops_a_step_is_counted_once_for_its_campaign()
     rows = caught([{"stopped": [[1, ["gap", "noise"]], [2, ["gap"]], [3, ["gap"]], [4, []]]}, {"stopped": []}])
     assert rows[0] == ["gap", "3", "2", "1"]
     assert rows[1] == ["noise", "1", "0", "0"]
-    assert len(rows) == len({*NAMES.values(), FAILED})
+    assert all(row[1:] == ["0", "0", "0"] for row in rows[2:])

@@ -7,7 +7,7 @@ import pytest
 
 from conftest import make_validation
 from ctxval import Campaign, Labels, Trajectory, searches
-from ctxval.certificates import LearnedDistance, Sample, require_learned
+from ctxval.certificates import CertificateOptions, Dynamics, Region, Sample, require_learned
 from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy
 from rig_thorough import more
@@ -18,37 +18,37 @@ POINTS = np.linspace(0.05, 0.95, 7)[:, None]
 @pytest.mark.slow
 def test_only_earlier_trials_are_learned_from() -> None:
     campaign = Campaign(make_validation(), search=searches.Random(), seed=3).run(8)
-    learned = campaign.provenance.learned
-    assert learned is not None
-    assert isinstance(learned, LearnedDistance)
+    dynamics, trials = campaign.recorder.dynamics, campaign.trials
     executed = [(t.unit_point, campaign.store.trajectory(t.number, "system")) for t in campaign.trials[:4]]
     study = DynamicsStudy(campaign.validation, 3)
     expected = study.prediction_of(study.learn(executed), executed)
     assert expected is not None
-    np.testing.assert_array_equal(learned.expected(POINTS, 4), expected.expected(POINTS)[0])
-    assert not np.array_equal(learned.expected(POINTS, 4), learned.expected(POINTS, 8))
+    np.testing.assert_array_equal(dynamics.expected(trials, POINTS, 4), expected.expected(POINTS)[0])
+    assert not np.array_equal(dynamics.expected(trials, POINTS, 4), dynamics.expected(trials, POINTS, 8))
     truth = campaign.validation.distances(campaign.validation.space.from_unit(POINTS))
-    assert np.abs(learned.expected(POINTS, 8) - truth).max() < 0.05 * np.ptp(truth)
+    assert np.abs(dynamics.expected(trials, POINTS, 8) - truth).max() < 0.05 * np.ptp(truth)
 
 
 def test_nothing_is_predicted_without_trajectories_and_data() -> None:
     validation = make_validation()
     validation.model.data = None  # type: ignore[attr-defined]
     campaign = Campaign(validation, search=searches.Random(), seed=3).run(1)
-    learned = campaign.provenance.learned
-    assert learned is not None
-    assert np.isnan(learned.expected(POINTS, 0)).all()
+    assert np.isnan(campaign.recorder.dynamics.expected(campaign.trials, POINTS, 0)).all()
 
 
-def test_tasks_are_independent_of_trials_and_repeat() -> None:
-    campaign = Campaign(make_validation(), search=searches.Random(), seed=3).run(2)
-    learned = campaign.provenance.learned
-    assert learned is not None
-    tasks = learned.tasks(500, 3)
-    assert tasks.shape == (500, 1)
-    np.testing.assert_array_equal(tasks, learned.tasks(500, 3))
-    assert not np.array_equal(tasks, learned.tasks(500, 4))
-    assert not np.isin(tasks, np.random.default_rng(3).random(500)).any()
+def test_further_tasks_are_independent_of_trials_and_repeat() -> None:
+    campaign = Campaign(make_validation(), search=searches.Random(), seed=3).run(2).audit(3)
+    options = CertificateOptions(Region(predictions=50))
+    found, again = (campaign.provenance_for(options).learned for _ in range(2))
+    assert found is not None
+    assert again is not None
+    assert found.predicted is not None
+    assert again.predicted is not None
+    sample = Sample.of(campaign.trials)
+    drawn = [sample.numbers[row] for row in sample.countable]
+    assert (found.predicted.before, len(found.predicted.executed)) == (drawn[0], len(drawn))
+    assert found.predicted.drawn.shape == (50,)
+    np.testing.assert_array_equal(found.predicted.drawn, again.predicted.drawn)
 
 
 def test_a_sample_keeps_the_predictions_and_a_kind_asks_for_them() -> None:
@@ -70,9 +70,9 @@ def test_a_sample_keeps_the_predictions_and_a_kind_asks_for_them() -> None:
 )
 def test_evidence_names_states_and_inputs_as_the_experiment_does(labels: Labels, coordinates: list[str]) -> None:
     campaign = Campaign(make_validation().with_parts(labels=labels), search=searches.Random(), seed=1).run(3)
-    learned = campaign.provenance.learned
+    learned = campaign.provenance_for(CertificateOptions(Dynamics(), 0.5)).learned
     assert learned is not None
-    evidence = learned.dynamics(0.5)
+    evidence = learned.evidence
     assert evidence is not None
     assert list(evidence.coverage.resolution) == coordinates
     assert set(evidence.coverage.marginal.coordinates) <= set(coordinates)
@@ -85,12 +85,11 @@ def test_a_fault_while_learning_is_named_and_not_taken_for_dynamics_that_cannot_
         raise ZeroDivisionError("no scale")
 
     campaign = Campaign(make_validation(), search=searches.Random(), seed=3).run(3)
-    learned = campaign.provenance.learned
-    assert learned is not None
     monkeypatch.setattr(DynamicsStudy, "learn", learn)
     for _ in range(2):
-        with pytest.raises(CertificateError, match=r"no dynamics can be learned: ZeroDivisionError: no scale\.$"):
-            learned.dynamics(0.5)
+        learned = campaign.provenance_for(CertificateOptions(Dynamics(), 0.5)).learned
+        assert learned is not None
+        assert (learned.evidence, learned.failure) == (None, "ZeroDivisionError: no scale")
 
 
 def test_a_result_that_was_replaced_teaches_what_replaced_it() -> None:

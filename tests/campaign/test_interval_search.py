@@ -36,14 +36,14 @@ from ctxval.certificates import (
     CheckedPrediction,
     DistanceBound,
     Dynamics,
-    DynamicsEvidence,
+    Evidence,
     StateInputCoverage,
     StateInputGap,
     UnsampledCorner,
     UnsampledParameter,
 )
 from ctxval.certificates.automatic import Automatic
-from ctxval.certificates.dynamics_diagnostics import POCKET
+from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, hypercube_in, share_missed
 from ctxval.core.coverage import UnvisitedRegion
 from ctxval.errors import InputError
@@ -108,12 +108,12 @@ def test_places_of_a_position_are_entered_before_a_validation() -> None:
     assert verdict.certificate is not None
     pocket = verdict.certificate.details["unvisited_region"]
     assert list(pocket["place"]) == ["x[0]", "x[1]"]
-    assert pocket["size"] <= POCKET
+    assert pocket["size"] <= LIMITS.region
     # The runs of the last tasks led into places, as nothing else was missing.
     less = campaign.recorder.dynamics.learned(campaign.trials[:-1])
     assert less is not None
     assert less.unvisited_region is not None
-    assert less.unvisited_region.size > POCKET
+    assert less.unvisited_region.size > LIMITS.region
 
 
 @pytest.mark.slow
@@ -326,11 +326,11 @@ def test_the_posterior_bound_predicts_nothing() -> None:
     assert not any(PREDICTION in (trial.note or {}) for trial in campaign.trials)
 
 
-def evidence(upper: float = 1.0, highest: float = 0.9) -> DynamicsEvidence:
+def evidence(upper: float = 1.0, highest: float = 0.9) -> Evidence:
     rng = np.random.default_rng(0)
     gap = StateInputGap(0.4, ("x[0]",), {"x[0]": 0.0})
     covered = StateInputCoverage(gap, gap, gap, {"x[0]": 0.1}, np.array([0.11, 0.22]), 9)
-    return DynamicsEvidence(
+    return Evidence(
         np.linspace(0.5 * upper, upper, 40),
         rng.random((40, 2)),
         highest,
@@ -387,7 +387,7 @@ def test_no_task_is_executed_a_second_time() -> None:
         assert np.abs(known - fresh).max(axis=1).min() > NEAR
         known = np.concatenate([known, fresh[None]])
     everywhere = np.stack(np.meshgrid(*[np.linspace(0, 1, 60)] * 2), axis=-1).reshape(-1, 2)
-    assert next_task(contested, everywhere, 0.2, 2.0, 0.95, CandidateFilter()) is None
+    assert next_task(replace(contested, best=0.2, threshold=2.0), everywhere, CandidateFilter()) is None
 
 
 def test_friction_at_rest_is_tried_at_the_least_that_nears_the_limit() -> None:
@@ -411,7 +411,8 @@ def test_a_task_is_new_by_the_parameters_that_change_predictions() -> None:
         return np.array([task[0], 0.123])
 
     def chosen(known: np.ndarray, spread: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> list[float]:
-        task = next_task(contested, known, 0.2, 2.0, 0.95, CandidateFilter(spread=spread, seen=seen))
+        question = replace(contested, best=0.2, threshold=2.0)
+        task = next_task(question, known, CandidateFilter(spread=spread, seen=seen))
         assert task is not None
         return list(task.tolist())
 
@@ -422,28 +423,8 @@ def test_a_task_is_new_by_the_parameters_that_change_predictions() -> None:
     assert chosen(with_another_value, lambda task, known: task) == farthest.tolist()
 
 
-def test_beside_a_failed_test_the_task_is_looked_for_that_it_would_make_worse() -> None:
-    validation, _ = linear(dim=2)
-    campaign = Campaign(validation, seed=1).run(3, explore=True)
-    assert campaign.worst is not None
-    worst, best = campaign.worst.unit_point, campaign.worst.distance
-    assert best is not None
-    search = IntervalSearch(campaign.recorder, CertificateOptions(Automatic()), 20, 2 * best, keeps=False)
-    point = tuple(np.round(1 - worst, 3).tolist())
-    failed = CheckedPrediction(2, best, best, best, 0.5 * best, stored=True, origin="spread", point=point)
-
-    def beside(test: CheckedPrediction) -> list[float] | None:
-        task = search._beside_a_failed_test(replace(evidence(best, best), predictions=(test,)))
-        return None if task is None else task.tolist()
-
-    assert beside(failed) == [point[0], *worst[1:]]
-    assert beside(replace(failed, explained=best)) == [point[0], *worst[1:]]
-    assert beside(replace(failed, explained=0.5 * best)) is None  # one function of state and input has it by now
-    assert beside(replace(failed, distance=best)) is None
-
-
-def asked(found: DynamicsEvidence, known: np.ndarray, threshold: float, best: float = 0.2) -> list[float]:
-    point = next_task(found, known, best, threshold, 0.95, CandidateFilter())
+def asked(found: Evidence, known: np.ndarray, threshold: float, best: float = 0.2) -> list[float]:
+    point = next_task(replace(found, best=best, threshold=threshold), known, CandidateFilter())
     assert point is not None
     return list(point.tolist())
 
@@ -494,7 +475,7 @@ def test_before_a_bound_is_possible_nothing_but_the_mean_is_searched() -> None:
     assert before is not None
     assert after is not None
     assert len(before.maxima) == 1
-    assert before.upper(0.95) == before.highest
+    assert before.upper == before.highest
     np.testing.assert_array_equal(before.points, before.local_maxima[:1])
     assert len(after.maxima) > 1
 
@@ -515,12 +496,12 @@ def test_evidence_is_the_same_after_it_was_kept() -> None:
     load = UnsampledParameter("load", 0.5, np.array([0.3, 0.4]))
     checked = (CheckedPrediction(3, np.nan, np.inf, np.inf, 0.9),)
     found = replace(evidence(), unsampled_parameter=load, predictions=checked, maxima=np.array([0.1, np.inf] * 20))
-    kept = DynamicsEvidence.from_json(json.loads(json.dumps(found.to_json())))
+    kept = Evidence.from_json(json.loads(json.dumps(found.to_json())))
     assert kept is not None
     assert json.dumps(kept.to_json()) == json.dumps(found.to_json())
     assert isinstance(kept.coverage.marginal.coordinates, tuple)
-    for wrong in (None, 3, {}, {**found.to_json(), "coverage": None}, {**found.to_json(), "more": 1}):
-        assert DynamicsEvidence.from_json(wrong) is None
+    for wrong in (None, 3, {}, {**found.to_json(), "coverage": None}, {**found.to_json(), "maxima": ["large"]}):
+        assert Evidence.from_json(wrong) is None
 
 
 def test_a_threshold_must_be_positive() -> None:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from conftest import Predicted
+from conftest import learned_by
 from ctxval import certificates
 from ctxval.certificates import (
     KINDS,
@@ -69,7 +69,7 @@ confidences = st.floats(0.01, 0.999)
 
 def sample(n: int = 9, origin: str = "acquisition") -> Sample:
     X = np.linspace(0.0, 1.0, n)[:, None]
-    learned = Predicted(lambda points: 0.9 + np.sin(4 * points[:, 0]))
+    learned = learned_by(lambda points: 0.9 + np.sin(4 * points[:, 0]), X)
     return Sample(X, 1.0 + np.sin(4 * X[:, 0]), [origin] * n, ["completed"] * n, learned=learned)  # type: ignore[list-item]
 
 

@@ -18,15 +18,15 @@ from ctxval.certificates import (
     CertificateOptions,
     DistanceBound,
     Dynamics,
-    DynamicsEvidence,
+    Evidence,
     Forecast,
+    Learned,
     Provenance,
     Sample,
     certify_dynamics,
 )
 from ctxval.certificates.bounds import NO_UNITS
-from ctxval.certificates.dynamics import bound_of
-from ctxval.certificates.dynamics_diagnostics import ACCURATE, GAP, PREDICTIONS
+from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.sentences.verdicts import undecided
 from ctxval.certificates.verdict import judge, judge_by
 from ctxval.core.coverage import UnvisitedRegion
@@ -44,23 +44,7 @@ def trials(count: int = 4, largest: float = 0.8) -> list[Trial]:
     ]
 
 
-class Learned:
-    """Numbers in place of a model."""
-
-    def __init__(self, evidence: DynamicsEvidence | None) -> None:
-        self.evidence = evidence
-
-    def dynamics(self, confidence: float, quantile: float = 0.9) -> DynamicsEvidence | None:
-        return self.evidence
-
-    def expected(self, points: np.ndarray, before: int) -> np.ndarray:
-        return np.full(len(points), np.nan)
-
-    def tasks(self, count: int, seed: int) -> np.ndarray:
-        return np.random.default_rng(seed).random((count, 2))
-
-
-def sample(evidence: DynamicsEvidence | None = GOOD, count: int = 4) -> Sample:
+def sample(evidence: Evidence | None = GOOD, count: int = 4) -> Sample:
     return replace(Sample.of(trials(count)), learned=Learned(evidence))
 
 
@@ -68,9 +52,9 @@ def test_the_bound_is_the_order_statistic_of_the_maxima() -> None:
     found = certify_dynamics(sample(), GOOD)
     assert found.doubt is None
     assert found.upper_bound == np.sort(GOOD.maxima)[38]  # 39 of 41 are 0.951
-    assert certify_dynamics(sample(), GOOD, 0.9).upper_bound == np.sort(GOOD.maxima)[36]
+    assert certify_dynamics(sample(), replace(GOOD, confidence=0.9)).upper_bound == np.sort(GOOD.maxima)[36]
     with pytest.raises(CertificateError, match="needs more than 40 posterior samples"):
-        certify_dynamics(sample(), GOOD, 0.99)
+        certify_dynamics(sample(), replace(GOOD, confidence=0.99))
 
 
 def test_draws_that_disagree_on_the_bound_leave_an_error_that_counts() -> None:
@@ -86,7 +70,7 @@ def test_exchangeable_maxima_exceed_the_bound_as_rarely_as_stated() -> None:
     """1e5 truths that are exchangeable with the draws, with any distribution of the maxima."""
     rng = np.random.default_rng(3)
     maxima = rng.lognormal(size=(100_000, 41))
-    upper = np.sort(maxima[:, 1:], axis=1)[:, GOOD.rank(0.95)]
+    upper = np.sort(maxima[:, 1:], axis=1)[:, GOOD.rank]
     assert (maxima[:, 0] > upper).mean() == pytest.approx(1 - 39 / 41, abs=0.003)
 
 
@@ -94,24 +78,31 @@ def test_exchangeable_maxima_exceed_the_bound_as_rarely_as_stated() -> None:
 def test_the_bound_is_never_below_what_was_executed_and_never_lowered_by_a_prediction(
     pairs: list[tuple[float, float]], best: float
 ) -> None:
-    evidence = replace(GOOD, predictions=tuple(prediction(k, *pair) for k, pair in enumerate(pairs)))
-    bound = bound_of(evidence, best, 0.95)
-    assert bound >= max(best, evidence.upper(0.95))
-    excess = max(max(distance - median, 0.0) for median, distance in pairs[-PREDICTIONS:])
-    assert bound == pytest.approx(max(best, evidence.upper(0.95)) + 0.5 * excess)
+    checked = tuple(prediction(k, *pair) for k, pair in enumerate(pairs))
+    evidence = replace(GOOD, predictions=checked, best=best)
+    assert evidence.bound >= max(best, evidence.upper)
+    excess = max(max(distance - median, 0.0) for median, distance in pairs[-LIMITS.predictions :])
+    assert evidence.bound == pytest.approx(max(best, evidence.upper) + 0.5 * excess)
 
 
 def test_a_bound_that_a_diagnostic_withdraws_keeps_no_threshold() -> None:
     found = certify_dynamics(sample(), replace(GOOD, executions=2))
-    assert "needs at least 3" in (found.doubt or "")
+    assert found.withdrawn_by == "few_executions"
     assert not found.covers(1e9)
+
+
+def test_the_certificate_names_the_check_that_withdraws_it() -> None:
+    certificate = certify_dynamics(sample(), replace(GOOD, left_out=0.9))
+    assert certificate.withdrawn_by == "left_out"
+    assert [each["code"] for each in certificate.details["open_checks"]] == ["left_out"]
+    assert certificate.bound is None
 
 
 def test_a_prediction_that_failed_matters_by_the_margin_to_the_threshold() -> None:
     found = certify_dynamics(sample(), replace(GOOD, predictions=(*GOOD.predictions, prediction(4, 0.6, 0.5))))
     assert found.doubt is None
     assert found.details["raised_from"] == pytest.approx(np.sort(GOOD.maxima)[38])
-    assert found.upper_bound == pytest.approx(found.details["raised_from"] + 0.1 / ACCURATE)
+    assert found.upper_bound == pytest.approx(found.details["raised_from"] + 0.1 / LIMITS.error)
     assert found.covers(3.1)
     assert not found.covers(1.1 * found.details["raised_from"])
     reason = judge_by(found, trials(4), 1.5).reason
@@ -142,7 +133,7 @@ def test_a_draw_that_diverges_leaves_no_bound() -> None:
 
 
 def test_many_coordinates_are_said_not_to_be_covered_jointly() -> None:
-    wide = replace(COVERED, pair=None, beyond=gap(0.9 * GAP))
+    wide = replace(COVERED, pair=None, beyond=gap(0.9 * LIMITS.gap))
     found = certify_dynamics(sample(), replace(GOOD, coverage=wide))
     assert found.doubt is None
     assert any("not all combinations" in one for one in found.assumptions)
@@ -295,7 +286,7 @@ def test_no_push_may_suffice() -> None:
 
 def test_pushed_distances_survive_json() -> None:
     evidence = replace(GOOD, pushed=PUSHED)
-    known = DynamicsEvidence.from_json(json.loads(json.dumps(evidence.to_json())))
+    known = Evidence.from_json(json.loads(json.dumps(evidence.to_json())))
     assert known is not None
     assert known.pushed is not None
     np.testing.assert_array_equal(known.pushed.everywhere, PUSHED.everywhere)
@@ -332,7 +323,7 @@ def test_a_validation_names_the_largest_region_that_no_execution_has_entered(
     pocket: UnvisitedRegion, sentence: str
 ) -> None:
     evidence = replace(GOOD, unvisited_region=pocket)
-    known = DynamicsEvidence.from_json(json.loads(json.dumps(evidence.to_json())))
+    known = Evidence.from_json(json.loads(json.dumps(evidence.to_json())))
     assert known is not None
     assert known.unvisited_region == pocket
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(known)))
@@ -346,7 +337,7 @@ def test_a_place_of_a_position_that_no_execution_has_entered_withdraws_the_bound
         0.2, {"x [m]": 0.55, "y [m]": -0.35}, {"x [m]": 0.2, "y [m]": 0.2}, ((0.5, 0.5), (0.1, 0.9))
     )
     evidence = replace(GOOD, unvisited_region=pocket)
-    known = DynamicsEvidence.from_json(json.loads(json.dumps(evidence.to_json())))
+    known = Evidence.from_json(json.loads(json.dumps(evidence.to_json())))
     assert known is not None
     assert known.unvisited_region == pocket
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(known)))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ctxval import TaskSpace, TaskSuite
-from ctxval.certificates import CheckedPrediction, DynamicsEvidence
+from ctxval.certificates import CheckedPrediction, Evidence
 from ctxval.certificates.drawn_distances import DrawnDistances
 from ctxval.certificates.envelope import (
     Envelope,
@@ -36,7 +36,7 @@ def drawn_from(points: np.ndarray, draws: int = 40, size: float = 0.05, seed: in
     return DrawnDistances(points, points[:, 1] + size * waves, *np.zeros((2, len(points))))
 
 
-def evidence_of(**changes: Any) -> DynamicsEvidence:
+def evidence_of(**changes: Any) -> Evidence:
     tests = tuple(
         CheckedPrediction(k, 0.5, 0.4, 0.42, 0.4, origin="spread", point=(k / 9, 0.4), explained=0.4)
         for k in range(2, 10)
@@ -48,7 +48,7 @@ POINTS = np.random.default_rng(3).random((250, 2))
 EXECUTED = [(np.array([0.5, 0.9]), 0.9)]
 
 
-def envelope(evidence: DynamicsEvidence | None = None, **changes: Any) -> Envelope:
+def envelope(evidence: Evidence | None = None, **changes: Any) -> Envelope:
     drawn = replace(drawn_from(POINTS), **changes)
     return envelope_of(SPACE, drawn, evidence or evidence_of(), EXECUTED, 0.6, 0.95)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,12 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from conftest import Predicted, make_validation
+from conftest import learned_by, make_validation
 from ctxval import Campaign, searches
 from ctxval.certificates import (
     Audit,
     Certificate,
     CertificateOptions,
+    Learned,
     Region,
     Sample,
     judge_by,
@@ -25,8 +27,15 @@ from ctxval.errors import CertificateError
 from rig_thorough import more
 
 CAMPAIGNS = 20_000
-FLAT = Predicted(lambda points: np.full(len(points), 0.5))
-SLOPE = Predicted(lambda points: points[:, 0])
+Function = Callable[[np.ndarray], np.ndarray]
+
+
+def flat(points: np.ndarray) -> np.ndarray:
+    return np.full(len(points), 0.5)
+
+
+def slope(points: np.ndarray) -> np.ndarray:
+    return np.asarray(points[:, 0])
 
 
 def region(
@@ -35,18 +44,23 @@ def region(
     return (options or Region()).certify(replace(sample, threshold=threshold), confidence)
 
 
-def draws(distances: list[float], learned: Predicted | None = FLAT, planned: list[int | None] | None = None) -> Sample:
+def draws(
+    distances: list[float],
+    function: Function | None = flat,
+    planned: list[int | None] | None = None,
+    predictions: int = 1000,
+) -> Sample:
     n = len(distances)
     states = ["failed" if math.isnan(distance) else "completed" for distance in distances]
     points = np.random.default_rng(0).random((n, 1))
-    return Sample(
-        points,
-        np.array(distances),
-        ["iid"] * n,
-        states,
-        planned=planned or [n] * n,
-        learned=learned,  # type: ignore[arg-type]
-    )
+    sample = Sample(points, np.array(distances), ["iid"] * n, states, planned=planned or [n] * n)  # type: ignore[arg-type]
+    counted = sample.countable
+    if function is None:
+        return sample
+    if not counted:
+        return replace(sample, learned=Learned())
+    learned = learned_by(function, points[counted], counted[0], predictions)
+    return replace(sample, learned=learned)
 
 
 # The statement
@@ -105,7 +119,7 @@ def _share_above(limit: np.ndarray, error: float) -> np.ndarray:
 
 def test_with_a_prediction_of_nothing_it_is_the_scenario_bound() -> None:
     distances = np.random.default_rng(1).random(60).tolist()
-    found = region(draws(distances, Predicted(lambda points: np.zeros(len(points)))))
+    found = region(draws(distances, lambda points: np.zeros(len(points))))
     assert found.details["margin"] == max(distances)
     assert found.details["volume_of_draws"] == pytest.approx(volume_bound(60, 0, 0.95 * 0.05))
     assert found.upper_bound == max(distances)
@@ -117,14 +131,14 @@ def test_a_constant_error_of_the_prediction_is_made_good_by_the_margin(
     distances: list[float], beta: float, shift: float
 ) -> None:
     found = region(draws(distances), confidence=1 - beta)
-    moved = region(draws(distances, Predicted(lambda points: np.full(len(points), 0.5 + shift))), confidence=1 - beta)
+    moved = region(draws(distances, lambda points: np.full(len(points), 0.5 + shift)), confidence=1 - beta)
     assert moved.upper_bound == pytest.approx(found.upper_bound, abs=1e-9)
     assert moved.volume == found.volume
 
 
 @given(st.lists(st.floats(0.0, 5.0), min_size=6, max_size=40), st.integers(0, 3), st.floats(0.1, 5.0))
 def test_discarding_lowers_the_margin_and_widens_the_volume(distances: list[float], k: int, threshold: float) -> None:
-    one, other = (region(draws(distances, SLOPE), threshold, options=Region(discard=j)) for j in (k, k + 1))
+    one, other = (region(draws(distances, slope), threshold, options=Region(discard=j)) for j in (k, k + 1))
     assert other.details["margin"] <= one.details["margin"]
     assert other.details["volume_of_draws"] >= one.details["volume_of_draws"]
     assert other.details["share_kept"] >= one.details["share_kept"]
@@ -132,13 +146,13 @@ def test_discarding_lowers_the_margin_and_widens_the_volume(distances: list[floa
 
 @given(st.lists(st.floats(0.0, 1.0), min_size=6, max_size=40), st.floats(0.1, 3.0))
 def test_a_higher_threshold_is_kept_on_a_larger_map(distances: list[float], threshold: float) -> None:
-    low, high = (region(draws(distances, SLOPE), tau) for tau in (threshold, 1.1 * threshold))
+    low, high = (region(draws(distances, slope), tau) for tau in (threshold, 1.1 * threshold))
     assert high.details["share_kept"] >= low.details["share_kept"]
     assert high.volume <= low.volume
 
 
 def test_the_share_of_the_map_is_estimated_with_its_error() -> None:
-    sample = draws([0.0, *np.random.default_rng(2).random(59)], Predicted(lambda points: 2 * points[:, 0]))
+    sample = draws([0.0, *np.random.default_rng(2).random(59)], lambda points: 2 * points[:, 0], predictions=4000)
     margin = region(sample).details["margin"]
     found = region(sample, 1.2, options=Region(predictions=4000))
     exact = np.clip((1.2 - margin) / 2, 0, 1)
@@ -157,7 +171,10 @@ def test_failures_and_tasks_without_a_prediction_count_as_violations() -> None:
     ):
         region(failed)
     assert region(failed, options=Region(discard=1)).details["margin"] == pytest.approx(-0.3)
-    partly = Predicted(lambda points: np.where(points[:, 0] < 0.9, 0.5, np.nan))
+
+    def partly(points: np.ndarray) -> np.ndarray:
+        return np.where(points[:, 0] < 0.9, 0.5, np.nan)
+
     sample = draws([0.2] * 30, partly)
     missing = int((sample.points[:, 0] >= 0.9).sum())
     assert missing > 0
@@ -169,7 +186,9 @@ def test_failures_and_tasks_without_a_prediction_count_as_violations() -> None:
 
 
 def test_what_cannot_be_certified_says_why() -> None:
-    nothing = Predicted(lambda points: np.full(len(points), np.nan))
+    def nothing(points: np.ndarray) -> np.ndarray:
+        return np.full(len(points), np.nan)
+
     for sample, options, message in (
         (draws([0.1] * 5, None), Region(), "the experiment is not loaded"),
         (draws([0.1] * 5, nothing), Region(), "nothing can be predicted from the trials before trial 0"),
@@ -179,21 +198,19 @@ def test_what_cannot_be_certified_says_why() -> None:
         with pytest.raises(CertificateError, match=message):
             region(sample, options=options)
     with pytest.raises(CertificateError, match="a region bound needs independent draws"):
-        region(Sample(np.zeros((2, 1)), np.ones(2), ["manual"] * 2, ["completed"] * 2, learned=FLAT))
+        region(Sample(np.zeros((2, 1)), np.ones(2), ["manual"] * 2, ["completed"] * 2, learned=Learned()))
 
 
 def test_only_the_draws_of_the_last_decision_count_and_the_prediction_is_older() -> None:
-    learned = Predicted(lambda points: np.full(len(points), 0.5))
-    found = region(draws([0.1] * 50, learned, planned=[20] * 20 + [50] * 30))
+    found = region(draws([0.1] * 50, planned=[20] * 20 + [50] * 30))
     assert found.trials == 30
-    assert set(learned.asked) == {20}
     assert found.details["learned_before"] == 20
     assert found.details["not_counted"] == 20
     assert "20 other independent draws do not count" in " ".join(found.assumptions)
 
 
 def test_it_validates_only_if_the_whole_volume_is_accepted() -> None:
-    sample = draws([0.1] * 70, SLOPE)
+    sample = draws([0.1] * 70, slope)
     found = region(sample, 2.0)
     assert found.upper_bound == 2.0
     assert 0.04 < found.details["volume_of_draws"] < found.volume < 0.05
@@ -231,10 +248,8 @@ def share_above_bound(seed: int) -> float:
     certificate = verdict.certificate
     assert certificate is not None
     assert certificate.details["learned_before"] == 6
-    learned = campaign.provenance.learned
-    assert learned is not None
     points = np.linspace(0, 1, 201)[:, None]
     truth = campaign.validation.distances(campaign.validation.space.from_unit(points))
-    bound = learned.expected(points, 6) + certificate.details["margin"]
+    bound = campaign.recorder.dynamics.expected(campaign.trials, points, 6) + certificate.details["margin"]
     assert certificate.details["margin"] < 0.1 * truth.max()
     return float((truth > bound).mean() - certificate.details["volume_of_draws"])

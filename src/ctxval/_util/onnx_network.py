@@ -1,16 +1,16 @@
-"""ONNX files: networks for models and policies, and graphs of operations that are written."""
+"""Networks from ONNX files, for models and policies."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
-from ctxval._util.files import MADE_BY, make_folder_of, read_bytes, written_whole
+from ctxval._util.files import read_bytes
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError, ModelError, ShapeError
@@ -153,79 +153,3 @@ def _port(node: Any, layered: bool = False) -> _Port:
     if layers is not None and width is not None:
         width *= layers
     return _Port(node.name, _TYPES[node.type], not count, layers, count[0] if count else None, width)
-
-
-def require_onnx() -> Any:
-    """Return the module onnx, if it is installed."""
-    return require_extra("onnx", "fit", "ONNX files need")
-
-
-@dataclass(frozen=True, eq=False)
-class GraphValue:
-    """A value in a graph, with the operations that add a node to it; all values share the nodes and the constants."""
-
-    name: str
-    onnx: Any
-    nodes: list[Any]
-    tensors: list[Any]
-
-    @classmethod
-    def first(cls, name: str) -> Self:
-        """Return the input of a new graph, rows of numbers."""
-        return cls(name, require_onnx(), [], [])
-
-    def node(self, kind: str, *others: Self | Array) -> Self:
-        """Return the result of an operation on this value and others; constants are broadcast."""
-        names = [(each if isinstance(each, GraphValue) else self.constant(each)).name for each in (self, *others)]
-        result = replace(self, name=f"value_{len(self.nodes)}")
-        self.nodes.append(self.onnx.helper.make_node(kind, names, [result.name]))
-        return result
-
-    def constant(self, values: Array) -> Self:
-        """Return a constant of this graph."""
-        name = f"constant_{len(self.tensors)}"
-        self.tensors.append(self.onnx.numpy_helper.from_array(np.asarray(values), name))
-        return replace(self, name=name)
-
-    def affine(self, weight: Array, bias: Array) -> Self:
-        return self.node("Gemm", weight, bias)
-
-    def squared_distances(self, centres: Array, scales: Array, factor: float = 1.0) -> Self:
-        """Return ``factor |(z - c) / l|^2`` for each centre c, which rounding must not make negative."""
-        inverse = factor / scales**2
-        mixed = self.affine((-2 * inverse * centres).T, (inverse * centres**2).sum(axis=1))
-        squares = (self * self).affine(np.repeat(inverse[:, None], len(centres), axis=1), np.zeros(len(centres)))
-        return (mixed + squares).node("Relu")
-
-    def write(
-        self,
-        path: str | Path,
-        title: str,
-        width: int,
-        outputs: dict[str, tuple[Self, str, list[Any]]],
-        notes: dict[str, str] | None = None,
-    ) -> Path:
-        """Write the graph whose input this is, rows of so many numbers, to an ONNX file, with texts by their names.
-
-        The outputs are values by name, with their type (``DOUBLE`` or ``BOOL``) and shape; ``"N"`` stands for rows.
-        """
-        helper, kinds, ends = self.onnx.helper, self.onnx.TensorProto, []
-        for name, (value, kind, shape) in outputs.items():
-            self.nodes.append(helper.make_node("Identity", [value.name], [name]))
-            ends.append(helper.make_tensor_value_info(name, getattr(kinds, kind), shape))
-        given = helper.make_tensor_value_info(self.name, kinds.DOUBLE, ["N", width])
-        graph = helper.make_graph(self.nodes, title, [given], ends, self.tensors)
-        # Versions that onnxruntime has read since 2022.
-        opset = [helper.make_opsetid("", 17)]
-        content = helper.make_model(graph, opset_imports=opset, ir_version=8, producer_name=MADE_BY)
-        helper.set_model_props(content, notes or {})
-        make_folder_of(path)
-        with written_whole(path) as file:
-            file.write(content.SerializeToString())
-        return Path(path)
-
-    def __add__(self, other: Self | Array) -> Self:
-        return self.node("Add", other)
-
-    def __mul__(self, other: Self | Array) -> Self:
-        return self.node("Mul", other)

@@ -18,7 +18,6 @@ from ctxval._util.progress import progress_shown, stage
 from ctxval._util.representation import call
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
-from ctxval.campaign.dynamics import LearnedFromTrials
 from ctxval.campaign.envelope import EnvelopeSearch
 from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.executors import Executor, worker_pool
@@ -32,9 +31,11 @@ from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.watching import FALSE_ALARMS, Watch
 from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Provenance, Verdict, assess, judge
 from ctxval.certificates.envelope import Envelope
+from ctxval.certificates.evidence import Learned
 from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.certificates.sample import without_success
+from ctxval.certificates.verdict import counterexample
 from ctxval.core.distance import Distance
 from ctxval.core.plan import StartOffset, input_difference, start_offset
 from ctxval.core.trajectory import Trajectory
@@ -500,10 +501,23 @@ class Campaign:
         return replaced(
             provenance_of_store(recorder.store),
             space=validation.space,
-            learned=LearnedFromTrials(validation, trials, recorder.dynamics),
+            learned=Learned(),
             start=max(((offset.size, f"{offset.text} (trial {number})") for offset, number in offsets), default=None),
             units=validation.labels.units,
         )
+
+    def provenance_for(
+        self, options: CertificateOptions, threshold: float | None = None, trials: Trials | None = None
+    ) -> Provenance:
+        """Return :attr:`provenance` with what a certificate of these options reads of the learned dynamics.
+
+        If an executed distance falsifies the threshold, the verdict needs nothing, and nothing is computed.
+        """
+        known, judged = self.provenance, self.recorder.trials if trials is None else trials
+        kind, confidence = options.kind, options.confidence
+        if threshold is not None and counterexample(judged, threshold, known.quantities, confidence, kind.quantile):
+            return known
+        return replaced(known, learned=self.recorder.dynamics.learned_for(judged, options))
 
     @checked
     def state_threshold(self, threshold: PositiveFloat) -> None:
@@ -545,7 +559,8 @@ class Campaign:
         options, recorder = CertificateOptions.or_automatic(certificate, confidence, resolution), self.recorder
         self.state_threshold(threshold)
         with progress_shown(progress), stage("certifying"):
-            return with_next_task(judge(recorder.trials, threshold, options, self.provenance), recorder, options)
+            known = self.provenance_for(options, threshold)
+            return with_next_task(judge(recorder.trials, threshold, options, known), recorder, options)
 
     @checked
     def certify(
@@ -562,7 +577,7 @@ class Campaign:
         """
         options = CertificateOptions.or_automatic(certificate, confidence, resolution)
         with progress_shown(progress), stage("certifying"):
-            certified = assess(self.trials, options, provenance=self.provenance).certificate
+            certified = assess(self.trials, options, provenance=self.provenance_for(options)).certificate
         assert certified is not None  # without a threshold, a refusal is raised
         return certified
 

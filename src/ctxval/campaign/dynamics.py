@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,15 @@ from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.history import at_points, executed_trials
 from ctxval.campaign.storage.store import Store
-from ctxval.certificates.dynamics import bound_of, draws_for
-from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, failed, jumps
-from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
+from ctxval.certificates.checks import is_open
+from ctxval.certificates.dynamics import draws_for
+from ctxval.certificates.evidence import Evidence, Learned, Predicted
 from ctxval.certificates.explained import ExplainedExecution
-from ctxval.certificates.prediction_tests import DRAWN
-from ctxval.core.quantiles import QUANTILE
+from ctxval.certificates.limits import LIMITS
+from ctxval.certificates.options import CertificateOptions
+from ctxval.certificates.predictions import CheckedPrediction
+from ctxval.certificates.sample import Sample
+from ctxval.certificates.scenario import countable_draws
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import REDEFINED, Trial, Trials
 from ctxval.core.validation import Validation
@@ -67,10 +71,10 @@ class CampaignDynamics:
         self._use(DynamicsStudy(validation, seed))
 
     def _use(self, study: DynamicsStudy) -> None:
-        self.study, self._learned = study, _Known(PREDICTIONS + 3)
+        self.study, self._learned = study, _Known(LIMITS.predictions + 3)
         self._parts: tuple[str, bytes] | None = None  # of the study, when it learned first
         # Predictions that no store has, by their trials: each verdict checks those of the last trials.
-        self._afterwards: Latest[Any, ExecutionPrediction | None] = Latest(2 * PREDICTIONS)
+        self._afterwards: Latest[Any, ExecutionPrediction | None] = Latest(2 * LIMITS.predictions)
 
     def use_quantile(self, quantile: float) -> None:
         """State the share of the executions of a task that distances are about, if the system is noisy."""
@@ -148,7 +152,7 @@ class CampaignDynamics:
         except Exception:  # users' parts
             return None
 
-    def screening(self, trials: Sequence[Trial], *, pending: bool = False) -> DynamicsEvidence | None:
+    def screening(self, trials: Sequence[Trial], *, pending: bool = False) -> Evidence | None:
         """Return quick evidence, whose bound is too low and whose diagnostics lack expensive ones.
 
         It has a few draws, and none but the posterior mean after fewer executions than a bound needs. With ``pending``
@@ -156,7 +160,7 @@ class CampaignDynamics:
         """
         with stage("searching the learned dynamics", self.study.search.screening_loops, "closed loops"):
             learned = self.learned(trials)
-            few = learned is not None and len(learned.executed) < FEWEST
+            few = learned is not None and len(learned.executed) < LIMITS.fewest
             if learned is not None and pending:
                 learned = self._as_if(learned, at_points(executed_trials(self._store, trials)), self._waiting(trials))
             try:
@@ -166,7 +170,7 @@ class CampaignDynamics:
                 self.failure = reason_of(error)
                 return None
 
-    def evidence(self, trials: Sequence[Trial], confidence: float, *, keep: bool = False) -> DynamicsEvidence | None:
+    def evidence(self, trials: Sequence[Trial], confidence: float, *, keep: bool = False) -> Evidence | None:
         """Return what the learned dynamics say about d*, which the store may keep; None if nothing can be learned."""
         kept = self.kept_evidence(trials, confidence)
         if kept is not None:
@@ -182,11 +186,11 @@ class CampaignDynamics:
             self._store.keep_computed(self._key(trials, confidence), evidence.to_json(), digest)
         return evidence
 
-    def kept_evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
+    def kept_evidence(self, trials: Sequence[Trial], confidence: float) -> Evidence | None:
         """Return :meth:`evidence` that the store keeps for these trials; None if there is none."""
         if self.extra_recordings():
             return None
-        return DynamicsEvidence.from_json(self._store.computed(self._key(trials, confidence)))
+        return Evidence.from_json(self._store.computed(self._key(trials, confidence)))
 
     def _key(self, trials: Sequence[Trial], confidence: float) -> str:
         text = json.dumps(
@@ -195,29 +199,28 @@ class CampaignDynamics:
         physical = "".join(f"{name} " for name in self.study.given.physical)
         return f"evidence {confidence} {self.study.quantile} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
-    def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence:
+    def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float) -> Evidence:
         draws, drawn_from = draws_for(confidence), learned.drawn_from
         without_model = learned.posterior.covariances.without_model
         known = {"noise": drawn_from.noise, "groups": drawn_from.functions_for(draws), "without_model": without_model}
-        evidence = self._evidence(learned, trials, learned.worst_case_of(draws), **known)
-        best, further = Trials(trials).largest, dict[str, Any]()
-        bound = bound_of(evidence, best, confidence)
-        further["executed"] = self._explained(learned, trials)
-        if (influential := learned.influential) is not None:
-            further["influential"] = tuple(influential.tolist())
-        further |= {"drift": learned.drift, "uneven": learned.uneven_friction}
-        if failed(evidence, bound) is not None:
-            further["suspect"] = learned.study.suspected_parameter(learned)
+        evidence = self._evidence(learned, trials, learned.worst_case_of(draws), confidence=confidence, **known)
+        influential = learned.influential
+        evidence = replace(
+            evidence,
+            executed=self._explained(learned, trials),
+            influential=None if influential is None else tuple(influential.tolist()),
+            drift=learned.drift,
+            uneven=learned.uneven_friction,
+            suspect=None if evidence.failed is None else learned.study.suspected_parameter(learned),
+        )
         # How many tests a verdict needs is not known here. Negligible errors are no function to search, nor to push.
-        if evidence.negligible or doubt_of(replace(evidence, tests=0, **further), best, bound):
-            return replace(evidence, **further)
+        if evidence.negligible or is_open(evidence, "learning", "coverage", "tested", "explained", "search"):
+            return evidence
         # Many closed loops, which only matter to a bound that nothing else withdraws.
-        jump = learned.study.search.largest_jump(drawn_from)
+        jump, further = learned.study.search.largest_jump(drawn_from), dict[str, Any]()
         further |= {"jump": jump, "unvisited_region": learned.unvisited_region}
         # The maxima of a distance with kinks lie on ridges, which deeper searches climb higher.
-        if is_kinked(learned.study.given.distance) or (
-            evidence.low_dimensional and jumps(replace(evidence, jump=jump), bound)
-        ):
+        if is_kinked(learned.study.given.distance) or (evidence.low_dimensional and replace(evidence, jump=jump).jumps):
             values, points = learned.intensified_search
             low, high = values.min(), values.max()
             further["disagreement"] = float(1 - low / high) if high > 0 else 0.0
@@ -251,17 +254,17 @@ class CampaignDynamics:
 
     def _evidence(
         self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase, noise: float = 0.0, **known: Any
-    ) -> DynamicsEvidence:
+    ) -> Evidence:
         noisy, actuator, predictions = learned.noisy, learned.study.actuator, list(self.checked(trials))
         # Drawn tests come with the distances of their tasks on what is learned by now.
-        drawn = [k for k, test in enumerate(predictions) if test.origin in DRAWN and test.stored and not test.is_noisy]
+        drawn = [k for k, test in enumerate(predictions) if test.is_test and not test.is_noisy]
         if drawn:
             expected = learned.expected(np.array([predictions[k].point for k in drawn]))
             for k, distance in zip(drawn, np.nan_to_num(expected, nan=1e30, posinf=1e30).tolist(), strict=True):
                 predictions[k] = replace(predictions[k], explained=distance)
         if learned.negligible:
             predictions = [replace(each, negligible=learned.negligible) for each in predictions]
-        return DynamicsEvidence(
+        return Evidence(
             **vars(worst),
             executions=len(learned.executed),
             noise=noise,
@@ -269,7 +272,7 @@ class CampaignDynamics:
             coverage=learned.coverage,
             unsampled_parameter=learned.unsampled_parameter,
             unsampled_corner=unsampled_corner(learned.executed, self.study.validation.space, learned.coverage.task),
-            low_dimensional=worst.points.shape[1] <= DENSE and self.study.planner.batched,
+            low_dimensional=worst.points.shape[1] <= LIMITS.low_dimensional and self.study.planner.batched,
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
             actuator=None if actuator is None else (actuator.delay, actuator.lag),
@@ -278,6 +281,9 @@ class CampaignDynamics:
             without_data=not learned.with_data,
             estimated=learned.study.given.outputs is not None,
             negligible=learned.negligible,
+            best=Trials(trials).largest,
+            worst=() if (largest := Trials(trials).worst) is None else tuple(largest.unit_point.tolist()),
+            idle=tuple(learned.study.unseen_parameters),
             **known,
         )
 
@@ -289,7 +295,7 @@ class CampaignDynamics:
             before = completed[:place]
             prediction = stored = self.stored_prediction(trial)
             if stored is None:
-                recent = place >= len(completed) - PREDICTIONS - 1
+                recent = place >= len(completed) - LIMITS.predictions - 1
                 if not recent or self.learned(before, alone=True) is None:
                     continue
                 key = tuple((each.number, each.distance) for each in completed[: place + 1])
@@ -315,38 +321,30 @@ class CampaignDynamics:
             checked.append(CheckedPrediction(trial.number, rank, median, upper, distance, z2, **how))
         return tuple(checked)
 
+    def expected(self, trials: Sequence[Trial], points: Array, before: int) -> Array:
+        """Return distances ``(m,)`` at points ``(m, d)`` predicted from trials with smaller numbers; NaN if unknown."""
+        prediction = self.prediction([trial for trial in trials if trial.number < before])
+        return np.full(len(points), np.nan) if prediction is None else prediction.expected(points)[0]
+
+    def learned_for(self, trials: Sequence[Trial], options: CertificateOptions) -> Learned:
+        """Return what a certificate of all trials reads of the learned dynamics."""
+        kind, space = options.kind, self.study.validation.space
+        with contextlib.suppress(CertificateError):  # the certificate refuses the trials itself
+            sample = replace(Sample.of(trials), suite=space.members)
+            if kind.needs_evidence(sample):
+                self.use_quantile(kind.quantile)
+                evidence = self.evidence(trials, options.confidence)
+                return Learned(evidence, None if evidence is not None else self.failure)
+            if count := kind.predicted_tasks:
+                drawn = countable_draws(sample, f"a {kind.name} bound")
+                before = min(drawn.numbers)
+                tasks = space.unit_draws(count, np.random.default_rng([before, 0x7461]))  # a stream of no trial
+                both = self.expected(trials, np.concatenate([drawn.points, tasks]), before)
+                return Learned(predicted=Predicted(before, both[: len(drawn)], both[len(drawn) :]))
+        return Learned()
+
     def stored_prediction(self, trial: Trial) -> ExecutionPrediction | None:
         """Return the prediction that was stored before an execution, if it is one of the present distance."""
         note = (trial.note or {}).get(PREDICTION)
         present = isinstance(note, dict) and note.get("experiment") == self.experiment
         return prediction_in(trial.note) if present else None
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class LearnedFromTrials:
-    """The :class:`ctxval.certificates.LearnedDistance` of a campaign. The system is never executed."""
-
-    validation: Validation  #: the map p -> d(p)
-    trials: Sequence[Trial]  #: all trials of the campaign
-    study: CampaignDynamics  #: what the trajectories teach of the dynamics
-    _predictions: dict[int, Prediction | None] = field(default_factory=dict, init=False)
-
-    def expected(self, points: Array, before: int) -> Array:
-        """Return distances ``(m,)`` at points ``(m, d)`` predicted from trials with smaller numbers; NaN if unknown."""
-        if before not in self._predictions:
-            self._predictions[before] = self.study.prediction([t for t in self.trials if t.number < before])
-        prediction = self._predictions[before]
-        return np.full(len(points), np.nan) if prediction is None else prediction.expected(points)[0]
-
-    def dynamics(self, confidence: float, quantile: float = QUANTILE) -> DynamicsEvidence | None:
-        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned."""
-        self.study.use_quantile(quantile)
-        evidence = self.study.evidence(self.trials, confidence)
-        if evidence is None and self.study.failure is not None:
-            raise CertificateError(f"no dynamics can be learned: {self.study.failure.rstrip('.')}.")
-        return evidence
-
-    def tasks(self, count: int, seed: int) -> Array:
-        """Return independent draws of tasks, points of the unit cube ``(count, d)``."""
-        # This random stream is none of those of trials.
-        return self.validation.space.unit_draws(count, np.random.default_rng([seed, 0x7461]))

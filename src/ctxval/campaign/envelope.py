@@ -16,11 +16,9 @@ from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.certificates import dynamics_diagnostics as diagnostics
 from ctxval.certificates.automatic import Automatic, WholeSuite
 from ctxval.certificates.drawn_distances import DrawnDistances
 from ctxval.certificates.dynamics import Dynamics, draws_for
-from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
 from ctxval.certificates.envelope import (
     Envelope,
     boundary_tasks,
@@ -29,8 +27,11 @@ from ctxval.certificates.envelope import (
     must_outlive_a_test,
     withdrawn,
 )
+from ctxval.certificates.evidence import Evidence
+from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.prediction_tests import DRAWN
+from ctxval.certificates.predictions import CheckedPrediction, missing_tests
 from ctxval.certificates.sample import without_success
 from ctxval.certificates.sentences.statements import EXECUTED_AGAIN, whole_suite_statement
 from ctxval.core.task_suite import TaskSuite
@@ -85,7 +86,7 @@ class EnvelopeSearch:
             smooth = self._of(*known, trials)  # soft contacts can be learned
             return envelope if envelope.share > smooth.share else smooth
 
-    def _of(self, learned: LearnedDynamics, evidence: DynamicsEvidence, trials: Sequence[Trial]) -> Envelope:
+    def _of(self, learned: LearnedDynamics, evidence: Evidence, trials: Sequence[Trial]) -> Envelope:
         """Return the envelope of what was learned, or why there is none."""
         space, units = self._recorder.validation.space, self._recorder.validation.labels.units
         threshold, confidence = self._threshold, self._confidence
@@ -112,9 +113,7 @@ class EnvelopeSearch:
         except Exception as error:  # users' parts, at states that no execution has reached
             return withdrawn(space, threshold, confidence, reason_of(error))
 
-    def _regular(
-        self, trials: Sequence[Trial], evidence: DynamicsEvidence
-    ) -> tuple[LearnedDynamics, DynamicsEvidence] | None:
+    def _regular(self, trials: Sequence[Trial], evidence: Evidence) -> tuple[LearnedDynamics, Evidence] | None:
         """Return what the regular transitions teach; None if all are regular, or if there is noise in them."""
         numbers = tuple(trial.number for trial in trials)
         if self._split is None or self._split[0] != numbers:
@@ -123,18 +122,18 @@ class EnvelopeSearch:
             except Exception:  # users' parts
                 self._split = numbers, None
         learned = self._split[1]
-        if learned is None or learned.posterior.noise > diagnostics.NOISE:
+        if learned is None or learned.posterior.noise > LIMITS.noise:
             return None
         without = learned.posterior.covariances.without_model
         return learned, replace(evidence, quantile=None, lags=0, noise=learned.posterior.noise, without_model=without)
 
-    def _left_out(self, learned: LearnedDynamics, evidence: DynamicsEvidence) -> DynamicsEvidence:
+    def _left_out(self, learned: LearnedDynamics, evidence: Evidence) -> Evidence:
         """Return evidence with the tests alone, each predicted from all executions of other tasks.
 
         Nothing was predicted of a test whose run leaves what these have recorded.
         """
-        most, tests = diagnostics.most_beyond(evidence), list[CheckedPrediction]()
-        stored = [test for test in evidence.predictions if test.stored and test.origin in DRAWN]
+        most, tests = evidence.most_beyond, list[CheckedPrediction]()
+        stored = [test for test in evidence.predictions if test.is_test]
         with stage("predicting each test without its own execution", len(stored), "tests"):
             for test in stored:
                 point = np.array(test.point)
@@ -174,24 +173,25 @@ class EnvelopeSearch:
         known = self._known(trials)
         if known is None:
             return None
-        explained = all(diagnostics.is_explained(known[1], each, self._threshold) for each in known[1].predictions)
+        explained = all(known[1].explains(each, self._threshold) for each in known[1].predictions)
         regular = None if known[1].quantile is None and explained else self._regular(trials, known[1])
         learned, evidence = regular or known
-        missing = diagnostics.missing_tests(evidence.predictions, evidence.tests)
+        missing = missing_tests(evidence.predictions, evidence.tests)
         if missing and self._left <= missing:
             return interval.test()
-        if evidence.unsampled_parameter is not None and diagnostics.unsampled_parameter(evidence) is not None:
-            return Choice.tested(evidence.unsampled_parameter.task)
+        parameter = evidence.unsampled_parameter
+        if parameter is not None and parameter.gap > evidence.limits.gap:
+            return Choice.tested(parameter.task)
         pool, is_suite = learned.study.search.pool, recorder.validation.space.members is not None
         drawn = self._at(learned, pool if is_suite else pool[:_SCREENED], settled=False)
-        below, leaving = drawn.mean <= self._threshold, drawn.uncovered(diagnostics.most_beyond(evidence))
+        below, leaving = drawn.mean <= self._threshold, drawn.uncovered(evidence.most_beyond)
         # Within three spreads above the mean, a task is uncertain.
         straddle = 3.0 * drawn.spread(self._threshold) - np.abs(drawn.mean - self._threshold)  # Bryan et al. 2006
         uncertain, uncovered = below & (straddle > 0), below & (leaving > 1)
         if drawn.crossed is not None:  # executions of these tasks would not teach the regular part
             uncertain, uncovered = uncertain & (drawn.crossed <= 0), uncovered & (drawn.crossed <= 0)
             straddle = np.where(drawn.crossed <= 0, straddle, -np.inf)
-        few = evidence.executions < diagnostics.fewest_executions(evidence)
+        few = evidence.executions < evidence.fewest_executions
         # Share of the tasks predicted below the threshold that may be uncertain or uncovered at the end.
         if few or (uncertain | uncovered).sum() > 0.03 * below.sum():
             score = straddle if uncertain.sum() >= uncovered.sum() else np.where(uncovered, leaving, -np.inf)
@@ -209,16 +209,17 @@ class EnvelopeSearch:
         recorder = self._recorder
         return self._interval.budget - recorder.trials.executions - len(recorder.trials.open)
 
-    def _known(self, trials: Sequence[Trial]) -> tuple[LearnedDynamics, DynamicsEvidence] | None:
+    def _known(self, trials: Sequence[Trial]) -> tuple[LearnedDynamics, Evidence] | None:
         """Return what the executions teach, and what they say of the predictions."""
         dynamics = self._recorder.dynamics
         learned, evidence = dynamics.learned(trials), dynamics.screening(trials)
         if learned is None or evidence is None:
             return None
         noise, without = learned.drawn_from.noise, learned.posterior.covariances.without_model
-        return learned, replace(evidence.needing(self._interval.tests), noise=noise, without_model=without)
+        needed = evidence.needing(self._interval.tests)
+        return learned, replace(needed, confidence=self._confidence, noise=noise, without_model=without)
 
-    def _drawn(self, learned: LearnedDynamics, evidence: DynamicsEvidence) -> DrawnDistances:
+    def _drawn(self, learned: LearnedDynamics, evidence: Evidence) -> DrawnDistances:
         """Return the drawn distances of the pool's tasks, of executed ones and of tasks next to the boundary."""
         pool, space = learned.study.search.pool, self._recorder.validation.space
         if space.members is not None:
@@ -238,7 +239,7 @@ class EnvelopeSearch:
     def _at(self, learned: LearnedDynamics, points: Array, *, settled: bool = True) -> DrawnDistances:
         draws = draws_for(self._confidence)
         values, beyond, away, crossed = learned.drawn_distances(points, draws, settled=settled)
-        return DrawnDistances(points, values, beyond, away / diagnostics.POCKET, crossed)
+        return DrawnDistances(points, values, beyond, away / LIMITS.region, crossed)
 
 
 def of_whole_suite(

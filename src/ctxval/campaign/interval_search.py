@@ -20,30 +20,19 @@ from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.next_task import CandidateFilter, next_task
 from ctxval.campaign.proposals import DesignContinuity, spread_tests
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule, Verdict
+from ctxval.certificates import CertificateOptions, Evidence, Sample, StoppingRule, Verdict
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic, WholeSuite
 from ctxval.certificates.bets import bets_against
 from ctxval.certificates.bounds import Quantities, with_units
+from ctxval.certificates.checks import Remedy, open_checks
 from ctxval.certificates.covering import RESOLUTION, covering
-from ctxval.certificates.dynamics import Dynamics, bound_of, certify_dynamics
-from ctxval.certificates.dynamics_diagnostics import (
-    FEWEST,
-    doubt_of,
-    held,
-    holds,
-    is_explained,
-    missing_tests,
-    mostly_fail,
-    only_a_failed_test,
-    only_tests_missing,
-    raised,
-    unentered_pocket,
-)
-from ctxval.certificates.explained import CONTRADICTED, LEVERAGE, evidence_against, least_explained
+from ctxval.certificates.dynamics import Dynamics, certify_dynamics
+from ctxval.certificates.explained import LEVERAGE
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import DistanceBound
 from ctxval.certificates.prediction_tests import DRAWN, HYPERCUBE, MANY, TESTS, hypercube_in
+from ctxval.certificates.predictions import missing_tests, mostly_fail
 from ctxval.certificates.sample import SAME
 from ctxval.certificates.verdict import counterexample, require_suite
 from ctxval.core.trial import Trial, Trials
@@ -51,7 +40,6 @@ from ctxval.errors import CertificateError, InputError
 from ctxval.learning.worst_case import is_kinked
 
 _HYPERCUBES = 128  # from which the one that is executed is chosen
-_TIMES = 4  # executions of a task that are chosen because one execution does not explain it
 _FAR = 10.0  # multiple of what is known or allowed from which a predicted distance is said to be dangerous
 
 
@@ -107,7 +95,7 @@ class IntervalSearch:
     def interval(self) -> tuple[float, float | None]:
         """The largest executed distance, and the bound that a few posterior samples give; None if they give none."""
         evidence = self._evidence()
-        return self.best, None if evidence is None else self._bound(evidence)
+        return self.best, None if evidence is None else evidence.bound
 
     @property
     def is_falsified(self) -> bool:
@@ -130,14 +118,10 @@ class IntervalSearch:
         # The next test, if the last one held and more are missing: nothing needs to be searched for that.
         if self.tests and self.predicts and trials and trials == trials.completed and trials[-1].origin in DRAWN:
             predictions = self.recorder.dynamics.checked(trials)
-            if predictions and held(predictions[-1], self.best) and missing_tests(predictions, self.tests):
+            if predictions and predictions[-1].held(self.best) and missing_tests(predictions, self.tests):
                 return self.test()
         evidence = self._evidence()
-        if evidence is not None and (task := self._beside_a_failed_test(evidence)) is not None:
-            return Choice.tested(task)
-        if evidence is None or self._fails(evidence):
-            return self._by_distance()
-        return self._by_dynamics(evidence)
+        return self._by_distance() if evidence is None or self._fails(evidence) else self._by_dynamics(evidence)
 
     def test(self) -> Choice:
         """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""
@@ -196,34 +180,6 @@ class IntervalSearch:
         likeliest = int(np.argmax(chances))
         return Choice.tested(tasks[likeliest]) if chances[likeliest] > 1 - quantile else None
 
-    def _beside_a_failed_test(self, evidence: DynamicsEvidence) -> Array | None:
-        """Return a task where a test that failed may be worst; None if there is no such test, or all are executed.
-
-        A dynamics that depends on the task is large where the one parameter that it depends on is that of the test and
-        the others are those of the worst task. Parameters that M's loops do not depend on come first. If one function
-        of state and input has the distance of the test by now, the test failed because too little was known.
-        """
-        bound = self._bound(evidence)
-        if raised(evidence, bound) <= self.limit:
-            return None
-        trials = self.recorder.trials
-        tests = (test for test in reversed(evidence.predictions) if test.stored and test.origin in DRAWN)
-        wrong = (test for test in tests if not holds(evidence, test, self.best))
-        unexplained = (t for t in wrong if t.is_noisy or t.explained is None or not is_explained(evidence, t, bound))
-        failed = next(unexplained, None)
-        if failed is None or trials.worst is None:
-            return None
-        worst = trials.worst.unit_point
-        known, learned = self._points(trials), self.recorder.dynamics.learned(trials)
-        unseen = [] if learned is None else learned.study.unseen_parameters
-        for j in [*unseen, *(j for j in range(len(worst)) if j not in unseen)][:6]:
-            task = worst.copy()
-            task[j] = failed.point[j]
-            task = task if self._suite is None else self.recorder.validation.space.rounded(task)
-            if np.abs(known - task).max(axis=1).min() > self._near:
-                return task
-        return None
-
     def _by_audit(self, kind: AnytimeAudit) -> Choice | None:
         """Return the next independent draw of an anytime audit, which may end whenever its bound suffices."""
         ended = self.recorder.trials.ended
@@ -246,105 +202,104 @@ class IntervalSearch:
         missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self.recorder.trials.ended))
         return self.test() if missing else None
 
-    def _by_dynamics(self, evidence: DynamicsEvidence) -> Choice | None:
+    def _by_dynamics(self, evidence: Evidence) -> Choice | None:
         """Return the task that the learned dynamics need, or that the posterior bound needs; None if one decides."""
         kind, confidence = self.options.kind, self.options.confidence
         dynamics, trials = self.recorder.dynamics, self.recorder.trials
-        # The whole evidence may decide if nothing that a few draws show leaves the verdict open.
-        bound, enough = self._bound(evidence), len(trials.ended) >= FEWEST
-        decides = enough and raised(evidence, bound) <= self.limit and doubt_of(evidence, self.best, bound) is None
+        # The whole evidence may decide if no check is open that a few draws show.
+        decides = not open_checks(evidence)
         if decides and evidence.unvisited_region is None and dynamics.kept_evidence(trials, confidence) is None:
             learned = dynamics.learned(trials)
             evidence = evidence if learned is None else replace(evidence, unvisited_region=learned.unvisited_region)
-        if decides and unentered_pocket(evidence) is None:
+            decides = not open_checks(evidence)
+        if decides:
             whole = dynamics.evidence(trials, confidence, keep=self.keeps)
             if whole is None:
                 return self._by_distance()
-            evidence = whole.needing(self.tests)
+            evidence = self._asked(whole)
             with suppress(CertificateError):
                 sample = replace(Sample.of(trials.ended), threshold=self.limit)
-                if certify_dynamics(sample, evidence, confidence).covers(self.limit):
+                if certify_dynamics(sample, evidence).covers(self.limit):
                     return None
-            if (task := self._again(evidence)) is not None:
-                return Choice.tested(task)
+        remedy = self._first_remedy(evidence)
+        if remedy.kind == "again":
+            return Choice.tested(remedy.tasks[0][0])
         # For `auto`, the posterior bound of the distance is tried after many executions, besides tests, that decided
         # nothing, and earlier if they cover the tasks, as they soon do in few dimensions.
-        lacks_tests = self._lacks_tests_alone(evidence)
+        lacks_tests = remedy.kind == "drawn"
         if isinstance(kind, Automatic) and evidence.quantile is None and self._suite is None:
             chosen = sum(trial.origin not in DRAWN for trial in trials)
-            patient = chosen < 16 or lacks_tests or unentered_pocket(evidence) is not None
-            if not patient:
+            in_a_region = any(opened.code == "unvisited_region" for opened in open_checks(evidence))
+            if chosen >= 16 and not lacks_tests and not in_a_region:
                 return self._by_distance()
             covers = not evidence.negligible and covering(self._points(trials), kind.resolution, 0) is not None
             if covers and self._by_distance() is None:
                 return None
         return self.test() if lacks_tests else self._by_evidence(evidence)
 
-    def _again(self, evidence: DynamicsEvidence) -> Array | None:
-        """Return a task whose further execution tells what one execution of a noisy system does not; else None."""
-        if self._suite is not None or evidence.quantile is None:
-            return None
-        if evidence.influential is not None:
-            return np.array(evidence.influential)
-        least = least_explained(evidence.executed)
-        if least is None or evidence_against(evidence.executed) <= CONTRADICTED:
-            return None
-        task = np.array(least.point)
-        times = sum(np.abs(trial.unit_point - task).max() <= SAME for trial in self.recorder.trials)
-        return task if times < _TIMES else None
+    def _first_remedy(self, evidence: Evidence) -> Remedy:
+        """Return what the first open check needs that an execution can close; tasks of a suite are executed once."""
+        known = len(self._known)
+        remedies = (opened.check.remedy(evidence, known) for opened in open_checks(evidence) if opened.check.remedy)
+        usable = (each for each in remedies if each.kind == "drawn" or len(each.tasks))
+        return next((each for each in usable if self._suite is None or each.kind != "again"), Remedy())
 
-    def _by_evidence(self, evidence: DynamicsEvidence) -> Choice:
-        """Return the task that the learned dynamics choose."""
-        best, limit, trials = self.best, self.limit, self.recorder.trials
+    def _by_evidence(self, evidence: Evidence) -> Choice:
+        """Return the first new task that the open checks need."""
+        trials, known, waiting = self.recorder.trials, self._known, self._points(self.recorder.trials.open)
         learned = self.recorder.dynamics.learned(trials)
         steady = DesignContinuity(self.recorder.dynamics.study.planner, None if learned is None else learned.expected)
-        # Failed ones count twice: without a reason, they are not repeated, although a start may jump next to them.
-        failed = trials.in_state("failed")
-        known, waiting = self._points([*trials.ended, *failed]), self._points(trials.open)
         new = CandidateFilter(self._near, steady)
         # Tasks that differ in parameters that change no prediction are one task, with values that are spread.
         if learned is not None and self._suite is None:
             new = CandidateFilter(self._near, steady, learned.spread_unseen, learned.study.seen_parameters)
-        point = next_task(evidence, known, best, limit, self.options.confidence, new)
+        point = next_task(evidence, known, new)
         if len(waiting) and (point is None or np.abs(waiting - point)[:, new.seen].max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.
+            best, limit = self.best, self.limit
             if learned is not None:
                 expected = learned.expected(waiting)
                 best = max(best, float(expected[np.isfinite(expected)].max(initial=0.0)))
                 limit = (1 + self.within) * best if self.threshold is None else limit
-            after = self.recorder.dynamics.screening(trials, pending=True) or evidence
-            known = self._points([*trials, *failed])
-            point = next_task(after, known, best, limit, self.options.confidence, new)
+            after = self.recorder.dynamics.screening(trials, pending=True)
+            after = evidence if after is None else self._asked(after)
+            known = self._points([*trials, *trials.in_state("failed")])
+            point = next_task(replace(after, best=best, threshold=limit), known, new)
         return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
     # What is known
 
-    def _evidence(self) -> DynamicsEvidence | None:
+    def _evidence(self) -> Evidence | None:
         """Return what the store keeps, or what a few posterior samples say; None if the certificate uses neither."""
         trials, dynamics = self.recorder.trials, self.recorder.dynamics
         if not self.predicts:
             return None
         evidence = dynamics.kept_evidence(trials, self.options.confidence) or dynamics.screening(trials)
-        return None if evidence is None else evidence.needing(self.tests)
+        return None if evidence is None else self._asked(evidence)
 
-    def _lacks_tests_alone(self, evidence: DynamicsEvidence) -> bool:
-        """Return whether nothing but tests is missing for a validation, as far as a few posterior samples say."""
-        best, bound = self.best, self._bound(evidence)
-        missing = only_tests_missing(evidence, best, bound) or only_a_failed_test(evidence, best, bound, self.limit)
-        return max(bound, evidence.highest) <= self.limit and missing
+    def _asked(self, evidence: Evidence) -> Evidence:
+        """Return evidence with the question that it shall answer."""
+        needed, confidence = evidence.needing(self.tests), self.options.confidence
+        return replace(needed, best=self.best, confidence=confidence, threshold=self.limit)
 
-    def _fails(self, evidence: DynamicsEvidence) -> bool:
+    @property
+    def _known(self) -> Array:
+        """The tasks that are not executed without a reason: ended ones, and failed ones twice.
+
+        A start may jump next to a failed one.
+        """
+        trials = self.recorder.trials
+        return self._points([*trials.ended, *trials.in_state("failed")])
+
+    def _fails(self, evidence: Evidence) -> bool:
         """Return whether predictions fail so often that the dynamics cannot be learned."""
         # Earlier predictions may have failed before it was known that a history, noise or dry friction matters.
         known_since = evidence.quantile is not None or evidence.lags > 0 or evidence.friction
         if known_since or isinstance(self.options.kind, Dynamics):
             return False
-        bound = evidence.upper(self.options.confidence)
+        bound = evidence.upper
         tolerated = max(min(bound, self.limit), self.limit - bound)  # as far as the margin to the limit allows
-        return mostly_fail([held(prediction, tolerated) for prediction in evidence.predictions])
-
-    def _bound(self, evidence: DynamicsEvidence) -> float:
-        return bound_of(evidence, self.best, self.options.confidence)
+        return mostly_fail([prediction.held(tolerated) for prediction in evidence.predictions])
 
     @property
     def _suite(self) -> Array | None:

@@ -1,4 +1,4 @@
-"""Which task narrows the interval of d* most: the one to execute next, of those that learned dynamics offer."""
+"""Which of the tasks that would help may be executed: those that are new, and whose distance is that of neighbours."""
 
 from __future__ import annotations
 
@@ -9,16 +9,8 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.campaign.dynamics import NEAR
-from ctxval.certificates import DynamicsEvidence
-from ctxval.certificates.dynamics_diagnostics import (
-    uncovered,
-    unentered_pocket,
-    unsampled_corner,
-    unsampled_parameter,
-    untested,
-)
-
-_NEARS = 0.7  # share of the way from the largest executed distance to the limit from which a draw is near it
+from ctxval.certificates.checks import in_turn, open_checks
+from ctxval.certificates.evidence import Evidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,50 +40,16 @@ class CandidateFilter:
         return None
 
 
-def next_task(
-    evidence: DynamicsEvidence, known: Array, best: float, limit: float, confidence: float, new: CandidateFilter
-) -> Array | None:
-    """Return the task to execute next, a point ``(d,)``; None if all tasks lie next to executed ones.
+def next_task(evidence: Evidence, known: Array, new: CandidateFilter) -> Array | None:
+    """Return the task to execute next, a point ``(d,)``; None if all tasks lie next to known ones ``(n, d)``.
 
-    These come first: a task whose predicted distance exceeds the limit; the task of the draw that sets the bound,
-    while the bound exceeds the limit; the task that leads farthest from the records, while they leave gaps; and
-    the task with the largest predicted distance, while no similar distance was executed or a deeper search found it.
-    With dry friction, the draw whose distance nears the limit with the least takes the place of the one at the bound.
-    Further tasks test the predictions, and if all of these are known, the task that is farthest from all others does.
-
-    The known tasks ``(n, d)`` are executed or open, ``best`` is the largest executed distance, and ``limit`` is what
-    the bound must not exceed.
+    It is the first new task among the remedies of the open checks, in the order of their table. If they have none, it
+    is one that tests the predictions further, or the one that is farthest from all known ones.
     """
-    order = np.argsort(evidence.maxima, kind="stable")
-    rank = evidence.rank(confidence)
-    highest = evidence.points[[*order[rank::-1], *order[:rank:-1]]]
-    if evidence.friction:  # one execution at the least friction at rest that nears the limit rules out all larger ones
-        first = int(np.searchsorted(evidence.maxima[order], best + _NEARS * (limit - best), side="right"))
-        highest = evidence.points[[*order[first:], *order[:first][::-1]]]
-    farthest, largest = evidence.coverage.task[None], evidence.local_maxima
-    exceeds = evidence.upper(confidence) > limit
-    # Every third execution leads farthest from the records in any case, but friction is known where they are dense.
-    if exceeds and len(known) % 3 == 2 and (not evidence.friction or uncovered(evidence)):
-        candidates = [farthest, highest]
-    elif evidence.highest > limit:
-        candidates = [largest, highest, farthest]
-    elif exceeds:
-        candidates = [highest, farthest]
-    elif uncovered(evidence):
-        candidates = [farthest, highest, largest]
-        if evidence.unsampled_parameter is not None and unsampled_parameter(evidence) is not None:
-            candidates = [evidence.unsampled_parameter.task[None], *candidates]
-        elif evidence.unsampled_corner is not None and unsampled_corner(evidence) is not None:
-            candidates = [evidence.unsampled_corner.task[None], *candidates]
-        elif evidence.unvisited_region is not None and unentered_pocket(evidence) is not None:
-            candidates = [np.array(evidence.unvisited_region.tasks), *candidates]
-    elif evidence.search_shortfall > 1 or untested(evidence, best, limit):
-        candidates = [largest, highest, farthest]
-    else:
-        candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]
-
+    remedies = [opened.check.remedy(evidence, len(known)) for opened in open_checks(evidence) if opened.check.remedy]
+    tasks = [task for remedy in remedies if remedy.kind == "new" for task in remedy.tasks]
     # Of random tasks, the one farthest from all known tasks comes first.
     others = np.random.default_rng(len(known)).random((256, known.shape[1]))
     away = np.abs(others[:, None] - known).max(axis=2).min(axis=1, initial=1.0)
-    candidates.append(others[np.argsort(-away, kind="stable")])
-    return new.first(np.concatenate(candidates), known, evidence.coverage.task)
+    tasks += [*in_turn(evidence, len(known)).tasks, others[np.argsort(-away, kind="stable")]]
+    return new.first(np.concatenate(tasks), known, evidence.coverage.task)

@@ -6,12 +6,13 @@ from ctxval.certificates.base import KINDS, Certificate, CertificateKind, requir
 from ctxval.certificates.convergence import is_validated, rate
 from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, farthest_task, most_contested
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
-from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, LearnedDistance
+from ctxval.certificates.evidence import Evidence, Learned
 from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.posterior import Diagnosis, DistanceBound, diagnose, instantaneous_bound
+from ctxval.certificates.predictions import CheckedPrediction
 from ctxval.certificates.provenance import Neighbour, Provenance
 from ctxval.certificates.sample import PLANNED, RecoveredFailure, Sample, require_learned
 from ctxval.certificates.scenario import Audit, Region, SamplingDiscarding, Scenario, samples_needed, tail, volume_bound
@@ -34,9 +35,9 @@ __all__ = [
     "Diagnosis",
     "DistanceBound",
     "Dynamics",
-    "DynamicsEvidence",
+    "Evidence",
     "Forecast",
-    "LearnedDistance",
+    "Learned",
     "Maxima",
     "Neighbour",
     "Provenance",

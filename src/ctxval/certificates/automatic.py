@@ -14,9 +14,10 @@ from ctxval._util.representation import counted
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION, covering, farthest_task
 from ctxval.certificates.dynamics import Dynamics
-from ctxval.certificates.dynamics_diagnostics import FEWEST, mostly_fail
+from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.posterior import DistanceBound
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
+from ctxval.certificates.predictions import mostly_fail
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences.statements import EXECUTED_AGAIN
 from ctxval.certificates.sentences.verdicts import supported as supported_by
@@ -67,6 +68,11 @@ class Automatic(CertificateKind):
     tests: NonNegativeInt = TESTS  #: executions at drawn tasks; those for learned dynamics must be predicted beforehand
     quantile: Probability = QUANTILE  #: the share of the executions of each task that a bound with noise is about
 
+    def needs_evidence(self, sample: Sample) -> bool:
+        """Return whether the dynamics bound is tried: a resolution of one's own asks for the posterior bound."""
+        usual = self.resolution == RESOLUTION and len(sample) >= LIMITS.fewest and not sample.failed
+        return usual and (sample.suite is None or bool(sample.not_executed))
+
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the first certificate that keeps the threshold, or else the one that is nearer to a decision.
 
@@ -75,10 +81,8 @@ class Automatic(CertificateKind):
         as its predictions hold.
         """
         threshold = sample.threshold
-        # A resolution of one's own asks for the posterior bound.
-        usual = self.resolution == RESOLUTION and sample.learned is not None
-        uses_dynamics = usual and len(sample) >= FEWEST and not sample.failed
-        if sample.suite is not None and (not sample.not_executed or not uses_dynamics):
+        uses_dynamics = sample.learned is not None and self.needs_evidence(sample)
+        if sample.suite is not None and not uses_dynamics:
             return WholeSuite().certify(sample, confidence)
         by_dynamics = None
         if uses_dynamics:
@@ -106,14 +110,14 @@ class Automatic(CertificateKind):
         origins = [origin for origin in sample.origins if self.tests and origin in DRAWN]
         dimension, uniform = sample.points.shape[1], sample.is_uniform
         shown = shown_by_tests(origins, dimension, confidence, uniform=uniform, selected=sample.selected)
-        doubt, missing = certificate.doubt, self.missing_tests(sample)
-        if doubt is None and missing:
+        details = {**certificate.details, "tests": {**shown, "largest_error": None}}
+        certificate, missing = replace(certificate, details=details), self.missing_tests(sample)
+        if certificate.doubt is None and missing:
             doubt = (
                 f"at least {missing} more {'task' if missing == 1 else 'tasks'} drawn over the whole task space must "
                 "be executed (`ctxval run` executes them)"
             )
-        details = {**certificate.details, "tests": {**shown, "largest_error": None}}
-        certificate = replace(certificate, details=details, doubt=doubt)
+            certificate = replace(certificate, doubt=doubt, withdrawn_by="tests_missing")
         if by_dynamics is None or _decides(certificate, threshold):
             return certificate
         if preferred:

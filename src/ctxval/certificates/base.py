@@ -37,6 +37,7 @@ class Certificate:
     assumptions: tuple[str, ...]  #: conditions under which the statement holds, one sentence each
     details: dict[str, Any] = field(default_factory=dict)  #: the numbers from which the statement is computed
     doubt: str | None = None  #: why it is withdrawn, so that its statement must not be used; None if it is not
+    withdrawn_by: str | None = None  #: the code of the check that withdraws it; None if it is not withdrawn
     error: float = 0.0  #: standard error of ``upper_bound`` if it is computed from random draws; else 0
     version: str = VERSION  #: the version of ctxval that computed it
     distribution: str | None = None  #: the distribution of tasks as a text, which ``volume`` is of; None if uniform
@@ -62,7 +63,9 @@ class Certificate:
     @property
     def numbers(self) -> dict[str, Any]:
         """The numbers that are printed; failures, which the assumptions list, and long lists are only in JSON."""
-        shown = {name: value for name, value in self.details.items() if name not in ("failures", "checked")}
+        shown = {
+            name: value for name, value in self.details.items() if name not in ("failures", "checked", "open_checks")
+        }
         return {**shown, "trials": self.trials, "version": self.version}
 
     def __str__(self) -> str:
@@ -128,6 +131,11 @@ class CertificateKind(ShortRepr, ABC):
     quantile = QUANTILE
     """The share of the executions of each task that a threshold is about, if they differ by noise."""
 
+    @property
+    def predicted_tasks(self) -> int:
+        """The number of drawn tasks of which it reads the distances that are predicted without the draws."""
+        return 0
+
     @classmethod
     def options(cls) -> tuple[str, ...]:
         """Return the names of its options: its fields, and ``volume`` if it validates but for a share of the tasks."""
@@ -138,6 +146,10 @@ class CertificateKind(ShortRepr, ABC):
         """Return an instance from those of the options that are its own; an option that is None keeps its default."""
         known = ((option.name, stated.get(option.name)) for option in fields(cls))
         return cls(**{name: value for name, value in known if value is not None})
+
+    def needs_evidence(self, sample: Sample) -> bool:
+        """Return whether the certificate of a sample reads what the executions teach of the dynamics."""
+        return False
 
     @abstractmethod
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:

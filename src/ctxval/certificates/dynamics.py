@@ -7,7 +7,7 @@ that share hyperparameters make this approximate. If M is rougher than the syste
 (:mod:`ctxval.learning.residual_data`).
 
 The bound lies if the prior is wrong: if a state is not recorded, or the dynamics jump. So
-:mod:`ctxval.certificates.dynamics_diagnostics` withdraws it unless predictions held that were made before executions,
+:mod:`ctxval.certificates.checks` withdraws it unless predictions held that were made before executions,
 and unless the records cover what the closed loops visit, and raises it if predictions failed.
 """
 
@@ -19,16 +19,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from ctxval._util.checked import NonNegativeInt, Probability, checked
+from ctxval._util.checked import NonNegativeInt, Probability
 from ctxval._util.registry import part
-from ctxval.certificates import dynamics_diagnostics as diagnostics
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.bounds import rank_within
+from ctxval.certificates.checks import fewest_missing, withdrawals
 from ctxval.certificates.covering import largest_empty_box
-from ctxval.certificates.dynamics_evidence import DynamicsEvidence
+from ctxval.certificates.evidence import Evidence
 from ctxval.certificates.explained import share_supported
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.prediction_tests import TESTS, shown_by_tests
+from ctxval.certificates.predictions import latest_tests
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed, require_learned
 from ctxval.certificates.sentences import statements
 from ctxval.certificates.sentences.withdrawals import AUDIT
@@ -73,27 +74,32 @@ class Dynamics(CertificateKind):
                 f"{listed(unknown)} failed or gave no distance, so d* is not bounded there; execute the task again, or "
                 f"audit.{advice_to_remeasure(sample)}"
             )
-        evidence = learned.dynamics(confidence, self.quantile)
+        evidence = learned.evidence
         if not (sample.best > 0 or (evidence is not None and evidence.negligible)):
             raise CertificateError(
                 "all distances are 0, so no prediction of a distance was tested. Check that the distance compares what "
                 f"differs; {AUDIT}."
             )
+        if evidence is None and learned.failure is not None:
+            raise CertificateError(f"no dynamics can be learned: {learned.failure.rstrip('.')}.")
         if evidence is None:
             raise CertificateError(
                 "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "
                 "controller can be designed."
             )
-        evidence = evidence.needing(self.tests)
-        certificate = certify_dynamics(sample, evidence, confidence)
+        evidence = replace(evidence.needing(self.tests), best=sample.best, confidence=confidence, threshold=threshold)
+        certificate = certify_dynamics(sample, evidence)
         if threshold is None or certificate.covers(threshold):
             return certificate
-        bound = bound_of(evidence, sample.best, confidence)
-        if diagnostics.raised(evidence, bound) > threshold and certificate.doubt == diagnostics.tests_missing(evidence):
-            certificate = replace(certificate, doubt=None)  # missing tests matter only to a bound that suffices
+        if evidence.raised > threshold and certificate.withdrawn_by == "tests_missing":
+            # Missing tests matter only to a bound that suffices.
+            certificate = replace(certificate, doubt=None, withdrawn_by=None)
         kept = float((evidence.maxima <= threshold).mean())
-        expected = Forecast(diagnostics.fewest_missing(evidence, sample.best, bound), kept, 1 - kept, fewest=True)
-        return replace(certificate, expected=expected)
+        return replace(certificate, expected=Forecast(fewest_missing(evidence), kept, 1 - kept, fewest=True))
+
+    def needs_evidence(self, sample: Sample) -> bool:
+        """Return whether all trials have a distance."""
+        return not sample.failed
 
 
 def draws_for(confidence: float) -> int:
@@ -101,46 +107,43 @@ def draws_for(confidence: float) -> int:
     return min(MOST_DRAWS, int(np.ceil(confidence / (1 - confidence))))
 
 
-@checked
-def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Probability = 0.95) -> Certificate:
-    """Return the bound that d* stays below with the confidence, from evidence of the same trials."""
+def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
+    """Return the bound that d* stays below with the confidence of the evidence, which is of the same trials."""
+    confidence, upper, error = evidence.confidence, evidence.raised, evidence.error
     rank_within(confidence, len(evidence.maxima))
-    bound, error = bound_of(evidence, sample.best, confidence), evidence.error(confidence)
-    upper = diagnostics.raised(evidence, bound)
     if not np.isfinite(upper + error):
         raise CertificateError(
             "the dynamics give no bound: the closed loops of some posterior samples diverge, or an execution could not "
             "be predicted. More executions narrow them."
         )
-    finite = evidence.maxima[np.isfinite(evidence.maxima)]
-    last = diagnostics.counted(evidence, bound)[-diagnostics.PREDICTIONS :]
-    tests = diagnostics.tested(evidence.predictions, evidence.tests)
+    finite, is_noisy = evidence.maxima[np.isfinite(evidence.maxima)], evidence.quantile is not None
+    last = evidence.counted()[-evidence.limits.predictions :]
+    tests = latest_tests(evidence.predictions, evidence.tests)
     drawn = [test.origin for test in tests]
-    coverage, worst = evidence.coverage, diagnostics.failed(evidence, bound)
-    doubt, differing = statements.both_outcomes(sample, stochastic=False), sample.differing(1e-6 * bound)
+    coverage, worst, opened = evidence.coverage, evidence.failed, withdrawals(evidence)
+    differing = sample.differing(1e-6 * evidence.bound)
+    doubt, withdrawn_by = statements.both_outcomes(sample, stochastic=False), "executions_differ"
     # Two executions of one task must not differ by more than a prediction may be wrong.
-    unlike = max(diagnostics.ACCURATE * bound, evidence.negligible)
-    if doubt is None and evidence.quantile is None and (rows := sample.differing(unlike)) is not None:
+    unlike = max(evidence.limits.error * evidence.bound, evidence.negligible)
+    if doubt is None and not is_noisy and (rows := sample.differing(unlike)) is not None:
         doubt = (
             f"{statements.two_distances(sample, rows)} in the recorded state, or was changed in between, so the bound "
             "is withdrawn; record more states, use --kind posterior, or use a new store after a change"
         )
+    if doubt is None and opened:
+        doubt, withdrawn_by = str(opened[0]), opened[0].code
     empty = None if sample.suite is not None else largest_empty_box(sample.points)
     statement = statements.dynamics_statement(upper, error, confidence, evidence.quantile)
     if evidence.negligible:
         statement = f"If {statements.SMALL_ERRORS}, d* is at most {upper:.6g}."
-    assumptions = statements.dynamics_assumptions(evidence)
-    doubt = doubt or diagnostics.doubt_of(evidence, sample.best, bound)
     level = upper if sample.threshold is None else sample.threshold
-    doubt = doubt or diagnostics.unsupported(evidence, level, bound)
     above = sum(each.distance > level for each in evidence.executed)
-    is_noisy = evidence.quantile is not None
     copied = {name: getattr(evidence, name) for name in _COPIED}
     details = {
         "best": sample.best,
         **({} if sample.suite is None else {"tasks": sample.tasks, "not_executed": sample.not_executed}),
         "gap": upper - sample.best,
-        "raised_from": None if worst is None else bound,
+        "raised_from": None if worst is None else evidence.bound,
         "raised_by_trial": None if worst is None else worst.trial,
         "error": error,
         "executions": evidence.executions,
@@ -152,7 +155,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "made": len(evidence.predictions),
             "stored_beforehand": sum(prediction.stored for prediction in evidence.predictions),
             "last_ones": len(last),
-            "held": sum(diagnostics.held(prediction, bound) for prediction in last),
+            "held": sum(prediction.held(evidence.bound, evidence.limits) for prediction in last),
         },
         "tests": {
             **shown_by_tests(
@@ -160,9 +163,8 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             ),
             "largest_error": max((test.error for test in tests), default=None),
         },
-        "checked": [
-            {**each.to_json(), "held": bool(diagnostics.holds(evidence, each, bound))} for each in evidence.predictions
-        ],
+        "checked": [{**each.to_json(), "held": bool(evidence.holds(each))} for each in evidence.predictions],
+        "open_checks": [each.to_json() for each in opened],
         "coverage_gap": coverage.marginal.size,
         "beyond_the_records": coverage.beyond.size,
         "coverage_gap_of_pairs": None if coverage.pair is None else coverage.pair.size,
@@ -176,12 +178,14 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
         "pushed": evidence.pushed and evidence.pushed.to_json(),
         "differing": None if differing is None else [sample.numbers[row] for row in differing],
     }
-    return Dynamics().certificate(sample, statement, upper, confidence, assumptions, details, doubt=doubt, error=error)
-
-
-def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> float:
-    """Return the order statistic of the maxima, raised by what searches and predictions have missed."""
-    excess = max((prediction.excess for prediction in evidence.predictions[-diagnostics.PREDICTIONS :]), default=0.0)
-    upper = evidence.upper(confidence) * evidence.search_shortfall
-    # A noisy execution may exceed the quantile that is bounded.
-    return (max(upper, best) if evidence.quantile is None else upper) + 0.5 * excess
+    return Dynamics().certificate(
+        sample,
+        statement,
+        upper,
+        confidence,
+        statements.dynamics_assumptions(evidence),
+        details,
+        doubt=doubt,
+        withdrawn_by=None if doubt is None else withdrawn_by,
+        error=error,
+    )

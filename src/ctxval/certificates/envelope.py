@@ -37,20 +37,8 @@ from ctxval._util.boxes import separated_rows
 from ctxval._util.files import write_text
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
+from ctxval.certificates.checks import CHECKS
 from ctxval.certificates.drawn_distances import FLOOR, LARGEST, DrawnDistances
-from ctxval.certificates.dynamics_diagnostics import (
-    PREDICTIONS,
-    SMALL,
-    agrees,
-    counted,
-    holds,
-    missing_tests,
-    most_beyond,
-    tested,
-    unlearned,
-    unsampled_parameter,
-)
-from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
 from ctxval.certificates.envelope_shape import (
     MANY,
     MULTIPLES,
@@ -59,7 +47,9 @@ from ctxval.certificates.envelope_shape import (
     exported,
     regions_inside,
 )
+from ctxval.certificates.evidence import Evidence
 from ctxval.certificates.prediction_tests import DRAWN
+from ctxval.certificates.predictions import CheckedPrediction, agrees, latest_tests, missing_tests
 from ctxval.certificates.sentences.statements import IRREGULAR, dynamics_assumptions, envelope_statement
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TaskSuite
@@ -185,21 +175,21 @@ def withdrawn(space: TaskSpace, threshold: float, confidence: float, doubt: str)
     return Envelope(space, threshold, confidence, "No envelope is stated.", doubt=doubt.rstrip("."))
 
 
-def doubt_of_envelope(evidence: DynamicsEvidence, threshold: float) -> str | None:
+def doubt_of_envelope(evidence: Evidence, threshold: float) -> str | None:
     """Return why no envelope can be stated, and what would help; None if one can."""
-    # Tasks that cannot be planned are no part of the envelope.
-    for doubt in (*unlearned(replace(evidence, unplanned=0.0), threshold), unsampled_parameter(evidence)):
-        if doubt is not None:
-            return doubt
+    known = replace(evidence, unplanned=0.0)  # tasks that cannot be planned are no part of the envelope
+    needed = (check for check in CHECKS if check.stage == "learning" or check.code == "unsampled_parameter")
+    if (opened := next(filter(None, (check.opened(known) for check in needed)), None)) is not None:
+        return str(opened)
     for test in evidence.predictions:
-        known = test.explained  # smaller differences raise the factor of the envelope
-        if known is None or test.is_noisy or agrees(test.distance, known, threshold):
+        explained = test.explained  # smaller differences raise the factor of the envelope
+        if explained is None or test.is_noisy or agrees(test.distance, explained, threshold):
             continue
-        if known <= threshold < test.distance:
+        if explained <= threshold < test.distance:
             return (
-                f"trial {test.trial} has the distance {test.distance:.4g}, and {known:.4g} on the learned dynamics, "
-                "which is below the threshold: the next state is no function of what is recorded, or the dynamics "
-                "depend on the task; record more states"
+                f"trial {test.trial} has the distance {test.distance:.4g}, and {explained:.4g} on the learned "
+                "dynamics, which is below the threshold: the next state is no function of what is recorded, or the "
+                "dynamics depend on the task; record more states"
             )
     missing = missing_tests(evidence.predictions, evidence.tests)
     if missing:
@@ -211,7 +201,7 @@ def doubt_of_envelope(evidence: DynamicsEvidence, threshold: float) -> str | Non
 
 
 def boundary_tasks(
-    drawn: DrawnDistances, evidence: DynamicsEvidence, threshold: float, confidence: float, tasks: Array, count: int
+    drawn: DrawnDistances, evidence: Evidence, threshold: float, confidence: float, tasks: Array, count: int
 ) -> Array:
     """Return at most so many of other tasks ``(N, d)``: those that are nearest to the boundary of the envelope."""
     surfaces = _interpolated(drawn, evidence, threshold, _raised(drawn, evidence, threshold, confidence)[0], ())
@@ -221,9 +211,7 @@ def boundary_tasks(
     return np.asarray(tasks[near][separated_rows(tasks[near], reach, count)])
 
 
-def _raised(
-    drawn: DrawnDistances, evidence: DynamicsEvidence, threshold: float, confidence: float
-) -> tuple[float, int | None]:
+def _raised(drawn: DrawnDistances, evidence: Evidence, threshold: float, confidence: float) -> tuple[float, int | None]:
     """Return k, and the trial that raised it; None if it is that of the draws.
 
     Contacts and hidden states are missed in both directions, so a distance that is too small counts as well.
@@ -240,22 +228,28 @@ def _raised(
     return (factor, None) if which is None or largest <= factor else (largest, which.trial)
 
 
-def rises_of(evidence: DynamicsEvidence, threshold: float) -> list[tuple[float, CheckedPrediction]]:
+def rises_of(evidence: Evidence, threshold: float) -> list[tuple[float, CheckedPrediction]]:
     """Return the standardised excesses of tests that count and of the last other predictions, with the predictions."""
-    tests = tested(evidence.predictions, evidence.tests)
-    last = {each.trial: each for each in [*tests, *counted(evidence, threshold)[-PREDICTIONS:]]}.values()
+    tests = latest_tests(evidence.predictions, evidence.tests)
+    last = {
+        each.trial: each for each in [*tests, *evidence.counted(threshold)[-evidence.limits.predictions :]]
+    }.values()
     rises = []
     for each in last:
         if min(each.distance, each.median) <= threshold:
             spread = (each.upper - each.median) / 1.645  # the 0.95 quantile of a normal distribution
             # An error that is large for the test's own distance may be as large a share of one near the threshold.
-            scale = 1.0 if holds(evidence, each, threshold) else threshold / max(each.median, SMALL * threshold)
+            scale = (
+                1.0
+                if evidence.holds(each, threshold)
+                else threshold / max(each.median, evidence.limits.small * threshold)
+            )
             rise = max(scale, 1.0) * each.excess / max(spread, 2 * FLOOR * threshold)
             rises.append((rise if np.isfinite(each.upper) else 0.0, each))
     return rises
 
 
-def must_outlive_a_test(drawn: DrawnDistances, evidence: DynamicsEvidence, threshold: float) -> bool:
+def must_outlive_a_test(drawn: DrawnDistances, evidence: Evidence, threshold: float) -> bool:
     """Return whether a drawn test raises k by so much that the tests of another hypercube are worth while."""
     largest = max((rise for rise, test in rises_of(evidence, threshold) if test.origin in DRAWN), default=0.0)
     kept = drawn.mean + largest * drawn.spread(threshold) <= threshold
@@ -264,13 +258,13 @@ def must_outlive_a_test(drawn: DrawnDistances, evidence: DynamicsEvidence, thres
 
 def _interpolated(
     drawn: DrawnDistances,
-    evidence: DynamicsEvidence,
+    evidence: Evidence,
     threshold: float,
     factor: float,
     executed: Sequence[tuple[Array, float]],
 ) -> Surfaces:
     """Return the surfaces of the bounds, and of the departures of loops of tasks whose bounds keep the threshold."""
-    departures = drawn.departures(most_beyond(evidence))
+    departures = drawn.departures(evidence.most_beyond)
     points, values = drawn.points, np.column_stack([drawn.upper(factor, threshold), departures])
     for point, distance in executed:
         if distance > threshold and evidence.quantile is None:
@@ -288,7 +282,7 @@ def _interpolated(
 def envelope_of(
     space: TaskSpace,
     drawn: DrawnDistances,
-    evidence: DynamicsEvidence,
+    evidence: Evidence,
     executed: Sequence[tuple[Array, float]],
     threshold: float,
     confidence: float,
@@ -315,14 +309,14 @@ def envelope_of(
         raised_by=raised_by,
         evaluated=len(drawn.points),
         executions=evidence.executions,
-        tests=sum(each.stored and each.origin in DRAWN for each in evidence.predictions),
+        tests=sum(each.is_test for each in evidence.predictions),
         quantile=evidence.quantile,
         assumptions=(*dynamics_assumptions(evidence), *([IRREGULAR] if irregular else [])),
         irregular=irregular,
         units=units,
     )
     if isinstance(space, TaskSuite):
-        envelope = _of_suite(envelope, space, drawn, most_beyond(evidence), executed)
+        envelope = _of_suite(envelope, space, drawn, evidence.most_beyond, executed)
     else:
         surfaces = _interpolated(drawn, evidence, threshold, factor, executed)
         tasks, least = space.unit_draws(COUNTED, np.random.default_rng(2)), surfaces
@@ -331,7 +325,7 @@ def envelope_of(
         tasks = tasks[(least(tasks) <= 1).all(axis=1)][:checks]
         if evaluate is not None and len(tasks):
             checked = evaluate(tasks)
-            outside = (checked.upper(factor, threshold) > 1) | (checked.leaving(most_beyond(evidence)) > 1)
+            outside = (checked.upper(factor, threshold) > 1) | (checked.leaving(evidence.most_beyond) > 1)
             surfaces = surfaces.without(tasks[outside], len(tasks))
             envelope = replace(envelope, checks=len(tasks))
         envelope = replace(envelope, margin=float(np.median(surfaces.errors[:, 0])), _surfaces=surfaces)
@@ -343,7 +337,7 @@ def envelope_of(
         envelope = replace(envelope, share=share, interpolated=share, regions=regions, uncovered=uncovered)
         if evaluate is not None:
             others = tasks[~inside][: checks // 2 or _OTHERS]
-            envelope = _with_loops(envelope, evaluate, most_beyond(evidence), executed, others)
+            envelope = _with_loops(envelope, evaluate, evidence.most_beyond, executed, others)
     return replace(envelope, statement=envelope_statement(envelope))
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.special import ndtri, stdtr
@@ -94,11 +94,13 @@ class DistanceBound(CertificateKind):
             "kernels": {"matern-3/2": rough, "matern-5/2": 1 - rough},
             "logarithm": float(np.mean([np.isfinite(process.warp.offset) for process in processes])),
             "length_scales": np.median(np.exp([each.log_scales for each in hyperparameters]), axis=0).tolist(),
-            "diagnosis": {name: value for name, value in vars(diagnosis).items() if name != "doubt"},
+            "diagnosis": {name: value for name, value in vars(diagnosis).items() if name not in ("code", "doubt")},
         }
         statement = statements.posterior_statement(upper, error, confidence, stochastic=stochastic)
         doubt = statements.both_outcomes(sample, stochastic=stochastic) or diagnosis.doubt
-        return self.certificate(sample, statement, upper, confidence, assumed, details, doubt=doubt, error=error)
+        by = None if doubt is None else diagnosis.code or "executions_differ"
+        withdrawn: dict[str, Any] = {"doubt": doubt, "withdrawn_by": by}
+        return self.certificate(sample, statement, upper, confidence, assumed, details, error=error, **withdrawn)
 
 
 def instantaneous_bound(sample: Sample) -> dict[str, float] | None:
@@ -130,7 +132,8 @@ class Diagnosis(ShortRepr):
     trial: int  #: number of the trial with the largest error upward
     left_out: float  #: root mean square of the standardised leave-one-out errors; about 1 if the process fits the data
     farthest: float  #: largest distance from a task to its nearest trial, in diagonals of the task space
-    doubt: str | None  #: why the bound is withdrawn, in one sentence; None if it is not
+    code: str | None  #: what withdraws the bound; None if nothing does
+    doubt: str | None  #: why, in one sentence; None if it is not withdrawn
 
 
 def diagnose(
@@ -160,19 +163,19 @@ def diagnose(
     surprise = float(-np.expm1(tested * np.log1p(-min(exceed[worst], 1 - 1e-16))))
     left_out = float(np.sqrt(np.mean([_left_out(process) for process in conditioned])))
     covered = X if covered is None else covered
-    farthest, d, doubt = farthest_task(covered), X.shape[1], None
+    farthest, d, code, doubt = farthest_task(covered), X.shape[1], None, None
     if surprise < LEVEL:
         others = "other trials" if unordered is not None and unordered[worst] else "trials before it"
         deviations = -ndtri(max(exceed[worst], 1e-300))
-        doubt = withdrawals.SURPRISING.format(trial=trial, deviations=deviations, others=others)
+        code, doubt = "surprising", withdrawals.SURPRISING.format(trial=trial, deviations=deviations, others=others)
     elif farthest > resolution:
         missing = covering(covered, resolution, 100)
         many = "more than 100" if missing is None else f"{len(missing)}"
-        doubt = withdrawals.FAR_TASK.format(farthest=farthest, resolution=resolution, many=many)
+        code, doubt = "far_task", withdrawals.FAR_TASK.format(farthest=farthest, resolution=resolution, many=many)
     elif bare := len(bare_corners(covered, resolution)):
         where = "ends of the task parameter's range" if d == 1 else "corners of the task space"
-        doubt = withdrawals.BARE_CORNERS.format(bare=bare, corners=2**d, where=where)
-    return Diagnosis(surprise, trial, left_out, farthest, doubt)
+        code, doubt = "bare_corners", withdrawals.BARE_CORNERS.format(bare=bare, corners=2**d, where=where)
+    return Diagnosis(surprise, trial, left_out, farthest, code, doubt)
 
 
 def _left_out_exceedances(conditioned: Conditioned) -> Array:

@@ -9,7 +9,7 @@ from typing import Any
 
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import Quantities
-from ctxval.certificates.dynamics_evidence import LearnedDistance
+from ctxval.certificates.evidence import Learned
 from ctxval.certificates.sentences import withdrawals
 from ctxval.core.space import DISTRIBUTION, TaskSpace
 from ctxval.core.task_distribution import distribution_text
@@ -36,7 +36,7 @@ class Provenance(ShortRepr):
 
     space: TaskSpace | None = None  #: the task space, to state lengths in its units; None if it is not known
     remarks: tuple[str, ...] = ()  #: assumptions of certificates, such as what was changed on the system
-    learned: LearnedDistance | None = None  #: what the experiment's model predicts; None if it is not loaded
+    learned: Learned | None = None  #: what the experiment's model predicts; None if it is not loaded
     distribution: str | None = None  #: the distribution of tasks as a text; None if it is uniform
     units: str = ""  #: the units of the distance
     start: tuple[float, str] | None = None  #: largest offset of a start, by the distance and as a text; None: unknown

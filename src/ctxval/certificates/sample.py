@@ -11,7 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
-from ctxval.certificates.dynamics_evidence import LearnedDistance
+from ctxval.certificates.evidence import Learned
 from ctxval.certificates.prediction_tests import hypercube_in
 from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
 from ctxval.errors import CertificateError
@@ -45,7 +45,7 @@ class Sample(ShortRepr):
     #: with the verdict, None if that is not known
     planned: Sequence[int | None] = ()
     made_good: tuple[RecoveredFailure, ...] = ()  #: left-out failures whose tasks were executed later
-    learned: LearnedDistance | None = None  #: what the experiment's model predicts; None if it is not loaded
+    learned: Learned | None = None  #: what the experiment's model predicts; None if it is not loaded
     distribution: str | None = None  #: the distribution of tasks as a text; None if it is uniform
     suite: Array | None = None  #: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box
     threshold: float | None = None  #: the threshold that is to be decided; None if there is none
@@ -70,7 +70,7 @@ class Sample(ShortRepr):
         return len(self.distances)
 
     @classmethod
-    def of(cls, trials: Sequence[Trial], learned: LearnedDistance | None = None) -> Sample:
+    def of(cls, trials: Sequence[Trial], learned: Learned | None = None) -> Sample:
         """Return the sample of a campaign's trials; a task that failed before its execution has failed as well.
 
         A failure is left out if the same task was executed with success later, unless it is an independent draw. The
@@ -201,7 +201,7 @@ class Sample(ShortRepr):
         return tuple(remarks)
 
 
-def require_learned(sample: Sample, kind: str) -> LearnedDistance:
+def require_learned(sample: Sample, kind: str) -> Learned:
     """Return the predictions that come with a sample, which this kind of certificate needs."""
     if sample.learned is None:
         raise CertificateError(

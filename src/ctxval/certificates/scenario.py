@@ -243,6 +243,11 @@ class Region(CertificateKind):
     discard: NonNegativeInt = 0
     predictions: PositiveInt = 1000  #: number M of predicted tasks, to estimate the share that keeps the threshold
 
+    @property
+    def predicted_tasks(self) -> int:
+        """The number of tasks that are predicted."""
+        return self.predictions
+
     @checked
     def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
         """Bound the distance by a prediction plus a margin from independent draws, but for a share of the tasks.
@@ -252,11 +257,12 @@ class Region(CertificateKind):
         """
         threshold, beta = sample.threshold, 1 - confidence
         learned, drawn = require_learned(sample, "region"), countable_draws(sample, "a region bound")
-        before = min(drawn.numbers)  # the prediction is learned from the trials before the draws
-        margin, unpredicted = _margin(drawn, learned.expected(drawn.points, before), before, self.discard)
+        assert learned.predicted is not None
+        before = learned.predicted.before  # the prediction is learned from the trials before the draws
+        margin, unpredicted = _margin(drawn, learned.predicted.executed, before, self.discard)
         n = len(drawn)
         volume = volume_bound(n, self.discard, (1 - _OF_MAP) * beta)
-        bounds = learned.expected(learned.tasks(self.predictions, before), before) + margin
+        bounds = learned.predicted.drawn + margin
         count, unknown = len(bounds), int(np.isnan(bounds).sum())
         limit = float(bounds[~np.isnan(bounds)].max(initial=-np.inf)) if threshold is None else float(threshold)
         outside = int((~(bounds <= limit)).sum())

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 from ctxval._util.files import read_toml
-from ctxval._util.onnx_network import require_onnx
 from ctxval._util.refusals import reworded
 from ctxval._util.representation import counted, task_text
 from ctxval._util.texts import shortened
@@ -29,7 +28,7 @@ from ctxval.studies.fitting import FitReport, FittedModel, FittedParameter, fit
 from ctxval.studies.fitting.excitation import Excitation, SignalKind
 from ctxval.studies.fitting.fit import HOLD_OUT, KINDS
 from ctxval.studies.fitting.fit import STEPS as FITTED
-from ctxval.studies.fitting.model_file import BESIDE, SUFFIXES, require_suffix, write_model_file
+from ctxval.studies.fitting.model_file import BESIDE, SUFFIXES, require_onnx, require_suffix, write_model_file
 from ctxval.studies.replay import PredictedTask, ReplayReport
 from ctxval.studies.replay import replay as compared
 from ctxval.studies.replay.report import STEPS as REPLAYED

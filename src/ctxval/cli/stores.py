@@ -152,7 +152,7 @@ def certify_store(store: Path, asked: Asked, allowed: Allowed, audit: int | None
             campaign.state_threshold(limit)  # before these draws are executed
         campaign.audit(audit)
     with stage("certifying"):
-        known = provenance_of_store(opened) if campaign is None else campaign.provenance
+        known = provenance_of_store(opened) if campaign is None else campaign.provenance_for(options)
         assessment = assess(opened.trials(), options, limit, known)
     others, verdict = [str(other.path) for other in known.beside], assessment.verdict
     if verdict is not None:

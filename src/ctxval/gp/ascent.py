@@ -151,14 +151,9 @@ class Evaluations:
 
 
 def ascend(
-    function: Values,
-    box: Box,
-    budget: int,
-    starts: Array,
-    rng: np.random.Generator,
-    rough: Values | None = None,
+    function: Values, box: Box, budget: int, starts: Array, rng: np.random.Generator, rough: Values | None = None,
     settings: AscentSettings = AscentSettings(),
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array]:  # fmt: skip
     """Search a box within the unit cube for the maximum; return all points ``(m, d)`` and values, the largest first.
 
     In few dimensions, the points of a fixed pool are evaluated, and then samples ever closer to the best ones. In more

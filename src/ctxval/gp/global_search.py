@@ -42,14 +42,9 @@ class GlobalMaximum:
 
 
 def search_globally(
-    function: Values,
-    dimension: int,
-    starts: Array,
-    rng: np.random.Generator,
-    *,
-    evaluations: int = 9000,
+    function: Values, dimension: int, starts: Array, rng: np.random.Generator, *, evaluations: int = 9000,
     settings: GlobalSearchSettings = GlobalSearchSettings(),
-) -> GlobalMaximum:
+) -> GlobalMaximum:  # fmt: skip
     """Search the unit cube for the maximum of a function, and return everything that was evaluated, of so many points.
 
     Values that are not finite are never a maximum. Starts ``(s, d)`` are evaluated first, moved into the cube.

@@ -45,12 +45,9 @@ RecordsOf = Callable[[Actuator], Sequence[Record]]
 
 
 def found_actuator(
-    model: Model,
-    records_of: RecordsOf,
-    before: Actuator | None = None,
-    evaluations: int = 80,
+    model: Model, records_of: RecordsOf, before: Actuator | None = None, evaluations: int = 80,
     settings: ActuatorSettings = ActuatorSettings(),
-) -> Actuator | None:
+) -> Actuator | None:  # fmt: skip
     """Return the delay and the lag with which the residual of M is most probably a function; None if they do not help.
 
     They help if the log evidence per recorded value, with the hyperparameters at their mode, is clearly larger than

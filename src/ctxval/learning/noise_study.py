@@ -174,13 +174,9 @@ class ChosenStructure(NamedTuple):
 
 
 def fit_structures(
-    model: Model,
-    records: Sequence[Record],
-    pairs: Array,
-    live: Mask,
-    chosen: ChosenStructure | None = None,
+    model: Model, records: Sequence[Record], pairs: Array, live: Mask, chosen: ChosenStructure | None = None,
     settings: NoiseSettings = NoiseSettings(),
-) -> tuple[InnovationsFit, ChosenStructure]:
+) -> tuple[InnovationsFit, ChosenStructure]:  # fmt: skip
     """Return the posterior of the most probable structure, or of a structure that was chosen before.
 
     Fewer lags are preferred: the fewest that determine the next record, or else those with the largest evidence.
@@ -215,12 +211,9 @@ def fit_structures(
 
 
 def predicted_by_history(
-    posterior: DynamicsPosterior,
-    records: Sequence[Record],
-    pairs: Array,
-    without_history: Array,
+    posterior: DynamicsPosterior, records: Sequence[Record], pairs: Array, without_history: Array,
     settings: NoiseSettings,
-) -> bool:
+) -> bool:  # fmt: skip
     """Return whether a history predicts the last record far better than state and input do, or neither predicts it."""
     last, sizes, live = records[-1], posterior.data.sizes, posterior.data.learned
 

@@ -24,13 +24,9 @@ def data_near(model: Model, loops: Trajectory) -> Transitions | None:
 
 
 def recorded_transitions(
-    model: Model,
-    data: Transitions | None,
-    executed: Sequence[Trajectory],
-    loops: Trajectory,
-    logged: Sequence[Trajectory] = (),
-    most: int = 3000,
-) -> tuple[Transitions, Rows] | None:
+    model: Model, data: Transitions | None, executed: Sequence[Trajectory], loops: Trajectory,
+    logged: Sequence[Trajectory] = (), most: int = 3000,
+) -> tuple[Transitions, Rows] | None:  # fmt: skip
     """Return the known transitions of the system and the execution of each; -1 for data that the model was made from.
 
     Returns None if there are none. Of more than ``most`` transitions, a random part is returned, and of recordings that

@@ -73,13 +73,9 @@ class RegularTransitions:
 
 
 def split_transitions(
-    model: Model,
-    transitions: Transitions,
-    sources: Rows,
-    seed: tuple[int, ...],
-    of_posterior: PosteriorSettings,
+    model: Model, transitions: Transitions, sources: Rows, seed: tuple[int, ...], of_posterior: PosteriorSettings,
     settings: RegularSettings = RegularSettings(),
-) -> RegularTransitions | None:
+) -> RegularTransitions | None:  # fmt: skip
     """Return the regular and the irregular transitions; None if there are no irregular ones, or too many."""
     data = residual_data(model, transitions, sources)
     if data is None or len(data.pairs) < len(transitions):

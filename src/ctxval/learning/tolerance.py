@@ -56,12 +56,9 @@ def push_response(
 
 
 def pushed(
-    mean: DynamicsDraws,
-    pushes: Array,
-    widths: Array | float = 1.0,
-    recorded: cKDTree | None = None,
+    mean: DynamicsDraws, pushes: Array, widths: Array | float = 1.0, recorded: cKDTree | None = None,
     near: float = 0.05,
-) -> DisturbedDynamics:
+) -> DisturbedDynamics:  # fmt: skip
     """Return a model that is pushed by ``(S, n)``, everywhere or away from records, in units of the widths ``(n,)``.
 
     A record shows the states that are ``near`` it in each coordinate.

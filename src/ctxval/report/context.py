@@ -264,10 +264,12 @@ def context_of_campaign(
     Its verdict is ``verdict``, if that was computed before, or else that against ``threshold`` by ``certificate``. If
     it is falsified and the tests of an envelope were executed, the envelope is ``envelope`` or computed.
     """
-    known, options = campaign.provenance, certificate or CertificateOptions()
+    options = certificate or CertificateOptions()
+    known = campaign.provenance
     if verdict is None and threshold is not None:
         # A report only reads: it does not record that the threshold was stated.
         with stage("certifying"):
+            known = campaign.provenance_for(options, threshold)
             verdict = with_next_task(judge(campaign.trials, threshold, options, known), campaign.recorder, options)
     falsified = verdict is not None and verdict.answer == "falsified"
     if envelope is None and verdict is not None and falsified and has_tests(campaign.recorder, options):

@@ -19,7 +19,8 @@ from ctxval.campaign.dynamics import prediction_in
 from ctxval.certificates import RESOLUTION
 from ctxval.certificates.bounds import at_most, of_tasks
 from ctxval.certificates.covering import bare_corners, farthest_task
-from ctxval.certificates.dynamics_diagnostics import ACCURATE, agrees
+from ctxval.certificates.limits import LIMITS
+from ctxval.certificates.predictions import agrees
 from ctxval.core.trial import Trial, Trials
 from ctxval.learning import ExecutionPrediction
 from ctxval.report.distance_model import distance_of
@@ -172,10 +173,10 @@ def predictions_held(context: ReportContext) -> Answer | None:
         return None
     size = max(float(context.distances.max()), context.bound or 0.0)
     held = sum(agrees(distance_of(trial), prediction.median, size) for trial, prediction in predicted)
-    made, within = len(predicted), quantity(ACCURATE * size, context.labels.units)
+    made, within = len(predicted), quantity(LIMITS.error * size, context.labels.units)
     text = (
         f"{held} of {counted(made, 'execution')} that were predicted beforehand came out within {within} of the "
-        f"prediction, which is {percent(ACCURATE)} of the largest distance or of the bound."
+        f"prediction, which is {percent(LIMITS.error)} of the largest distance or of the bound."
     )
     return "good" if held == made else "attention", text, {"made": made, "held": held}
 

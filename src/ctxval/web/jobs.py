@@ -154,8 +154,9 @@ def judge(served: ServedCampaign) -> Verdict | None:
         return None
     with stage("computing the verdict"):
         served.campaign.refresh()
-        ended, known = served.campaign.trials.ended, served.campaign.provenance
-        return judge_trials(ended, served.threshold, served.certificate, known)
+        ended, options = served.campaign.trials.ended, served.certificate
+        known = served.campaign.provenance_for(options, served.threshold, ended)
+        return judge_trials(ended, served.threshold, options, known)
 
 
 def draw(served: ServedCampaign) -> Pictures:

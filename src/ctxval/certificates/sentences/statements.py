@@ -18,7 +18,7 @@ from ctxval.certificates.bounds import (
     with_error,
     with_units,
 )
-from ctxval.certificates.dynamics_evidence import DynamicsEvidence
+from ctxval.certificates.evidence import Evidence
 from ctxval.certificates.sample import Sample, listed
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ _WITHOUT_DATA = (
 )
 
 
-def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
+def dynamics_assumptions(evidence: Evidence) -> tuple[str, ...]:
     """Return what the bound from learned dynamics assumes."""
     coordinates = len(evidence.coverage.resolution)
     prior = (

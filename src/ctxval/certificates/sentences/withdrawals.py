@@ -59,14 +59,14 @@ LEFT_OUT = (
     "the posterior samples of the dynamics understate the predictive uncertainty: they lack {percent:.0f} % of the "
     "largest posterior variance, and at most {most:g} % is allowed; more executions reduce it"
 )
-BEYOND = "predicted runs leave the recorded range of {gap}"
+GAP_AT = "{coordinates} by {percent:.2g} % (at {place}); `ctxval run` executes a task that goes there"
+BEYOND = f"predicted runs leave the recorded range of {GAP_AT}"
 DIVERGED = (
     "predicted runs diverge: they leave the records by more than ten times the range that most of them visit, so "
     "too little is learned to predict them; execute smaller tasks first, and be ready to stop the system"
 )
-GAP = "predicted runs enter a gap in the records of {gap}"
-PAIR_GAP = "predicted runs enter a gap in the joint records of {gap}"
-GAP_AT = "{coordinates} by {percent:.2g} % (at {place}); `ctxval run` executes a task that goes there"
+GAP = f"predicted runs enter a gap in the records of {GAP_AT}"
+PAIR_GAP = f"predicted runs enter a gap in the joint records of {GAP_AT}"
 UNTRIED = (
     "the parameter {name} hardly changes the closed loops of the model, so what it changes in the system cannot be "
     "learned from states and inputs, and some of its values are {percent:.0f} % of its range away from every executed "
@@ -92,13 +92,16 @@ TESTS_MISSING = (
     "at least {missing} more {executions} must be predicted beforehand, at tasks drawn over the whole task space "
     "(`ctxval run` executes them)"
 )
-JUMPS = (
-    "{what} if a task changes by a thousandth of its ranges, so a search may miss the largest distance: the "
-    "controllers change abruptly from task to task, as those of a model with kinks do, or the closed loop does; use a "
-    "smoother model, or an audit"
+NEEDLE = (
+    "one of the largest predicted distances falls by {percent:.0f} % if a task changes by a thousandth of its ranges, "
+    "so a search may miss the largest distance: the controllers change abruptly from task to task, as those of a model "
+    "with kinks do, or the closed loop does; use a smoother model, or an audit"
 )
-JUMP = "the predicted distance jumps by up to {percent:.2g} % of the bound"
-NEEDLE = "one of the largest predicted distances falls by {percent:.0f} %"
+JUMP = (
+    "the predicted distance jumps by up to {percent:.2g} % of the bound if a task changes by a thousandth of its "
+    "ranges, so a search may miss the largest distance: the controllers change abruptly from task to task, as those of "
+    "a model with kinks do, or the closed loop does; use a smoother model, or an audit"
+)
 SEARCHES_DIFFER = (
     "searches of the learned dynamics find largest distances that differ by {percent:.0f} %, because the controllers "
     "or the closed loop change abruptly from task to task; an execution of the task of the largest one helps (`ctxval "

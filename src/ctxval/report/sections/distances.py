@@ -62,14 +62,14 @@ def _estimated(context: ReportContext, unit: Array) -> Band | None:
 
     That is the one which predicts the executed distances better, each from the other trials.
     """
-    model, learned = context.distance_model, context.provenance.learned
-    if learned is None or not (context.batched or context.space.dimension == 1):
+    model, dynamics = context.distance_model, context.dynamics
+    if dynamics is None or not (context.batched or context.space.dimension == 1):
         return None if model is None else model.predict(unit)
     errors = np.array([replay.distance - context.recordings[k].distance for k, replay in context.replays.items()])
     if model is None or (errors**2).mean() <= ((model.left_out.median - model.values) ** 2).mean():
         # The user's parts, at states that no execution has reached, must not end a report.
         with suppress(Exception), stage("predicting distances", len(unit), "tasks"):
-            values = learned.expected(unit, len(context.trials))
+            values = dynamics.expected(context.trials, unit, len(context.trials))
             if np.isfinite(values).any():
                 return Band(values, values, values)
     return None if model is None else model.predict(unit)
@@ -178,15 +178,15 @@ def _predicted(context: ReportContext, model: DistanceModel) -> Chart:
 
 def _region(context: ReportContext) -> list[Markup]:
     """Return where the prediction plus the margin of a region certificate keeps the threshold; nothing without one."""
-    certificate, learned, tau = context.certificate, context.provenance.learned, context.threshold
-    if certificate is None or certificate.kind != "region" or learned is None or tau is None:
+    certificate, dynamics, tau = context.certificate, context.dynamics, context.threshold
+    if certificate is None or certificate.kind != "region" or dynamics is None or tau is None:
         return []
     margin, before = float(certificate.details["margin"]), int(certificate.details["learned_before"])
     space, d, model = context.space, context.space.dimension, context.distance_model
     unit = np.linspace(0, 1, _CURVE)[:, None]
     if d > 1:
         unit = _grid_of_tasks() if d == 2 else np.random.default_rng(0).random((400, d))
-    bounds = learned.expected(unit, before) + margin
+    bounds = dynamics.expected(context.trials, unit, before) + margin
     inside, points, label = bounds <= tau, space.from_unit(unit), f"predicted {context.distance_label} + margin"
     meaning = paragraph(
         f"A task keeps the threshold {number(tau)} if its predicted distance plus the margin {number(margin)} of the "

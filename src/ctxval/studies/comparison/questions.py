@@ -23,7 +23,7 @@ from ctxval.certificates import CertificateOptions, judge
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.bounds import ERRORS
 from ctxval.certificates.difference import MeanDifference, PairedDifferences, mean_difference
-from ctxval.certificates.dynamics_diagnostics import TESTED
+from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.sample import SAME
 from ctxval.core.trial import Trial
 from ctxval.studies.comparison.candidates import Candidate, Decision, Executions, TrialNote
@@ -111,7 +111,7 @@ class WorstQuestion:
             noted = [pair for pair in candidate.noted if pair[1].question == "worst" and pair[1].predicted]
             raised = [(trial.distance or 0.0) / (note.predicted or 1.0) for trial, note in noted]
             # A prediction is used if one of the last executions that were to raise the largest distance came near it.
-            trusted = len(raised) < self.insist or max(raised[-self.insist :]) >= TESTED
+            trusted = len(raised) < self.insist or max(raised[-self.insist :]) >= LIMITS.tested
             value, task = highest if highest is not None and trusted else (0.0, None)
             expected[candidate.name] = (max(value, candidate.largest), task if value > candidate.largest else None)
         return expected
@@ -125,14 +125,15 @@ class WorstQuestion:
         # So far above that its bound is worth executions.
         if worse.largest <= 1.02 * max(better.largest, expected[better.name][0]):
             return count <= others  # neither is clearly worse: they are executed in turn
-        return worse.largest < TESTED * expected[worse.name][0] and count < self.insist + others
+        return worse.largest < LIMITS.tested * expected[worse.name][0] and count < self.insist + others
 
     def _certified(self, better: Candidate) -> bool:
         """Keep all decisions by the certificate of a candidate; return whether there is a new one."""
         new = False
         for other in [worse for first, worse in self.undecided if first is better and worse.largest > better.largest]:
             # Nobody has stated this threshold to the campaign.
-            verdict = judge(better.campaign.trials, other.largest, self.options, better.campaign.provenance)
+            known = better.campaign.provenance_for(self.options, other.largest)
+            verdict = judge(better.campaign.trials, other.largest, self.options, known)
             if verdict.answer == "validated" and verdict.certificate is not None:
                 names, certificate = (better.name, other.name), verdict.certificate
                 bound, count = certificate.upper_bound + ERRORS * certificate.error, self.executions.count

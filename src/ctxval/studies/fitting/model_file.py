@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.files import MADE_BY, write_text
-from ctxval._util.onnx_network import GraphValue, require_onnx
+from ctxval._util.arrays import Array
+from ctxval._util.files import MADE_BY, make_folder_of, write_text, written_whole
+from ctxval._util.refusals import require_extra
 from ctxval._util.toml import toml_text
 from ctxval.core.labels import units_of
 from ctxval.core.model import Model
@@ -81,10 +82,26 @@ def write_model_file(path: Path, model: Model, step: str | None = None) -> list[
 def write_onnx(path: str | Path, model: Model) -> None:
     """Write a model as an ONNX file with one input ``(x, u)`` and the output ``x_next``."""
     _require_onnx(model)
-    z = GraphValue.first("z")
-    following, n, m = _next_state(z, model)
-    notes = {"ctxval": names_as_text(model)}
-    z.write(path, "step", n + m, {"x_next": (following, "DOUBLE", ["N", n])}, notes)
+    graph = _Graph()
+    following, n, m = _next_state(graph, "z", model)
+    helper, real = graph.onnx.helper, graph.onnx.TensorProto.DOUBLE
+    nodes = [*graph.nodes, helper.make_node("Identity", [following], ["x_next"])]
+    given, returned = (
+        helper.make_tensor_value_info(*end) for end in (("z", real, ["N", n + m]), ("x_next", real, ["N", n]))
+    )
+    whole = helper.make_graph(nodes, "step", [given], [returned], graph.constants)
+    # Versions that onnxruntime has read since 2022.
+    opset = [helper.make_opsetid("", 17)]
+    content = helper.make_model(whole, opset_imports=opset, ir_version=8, producer_name=MADE_BY)
+    helper.set_model_props(content, {"ctxval": names_as_text(model)})
+    make_folder_of(path)
+    with written_whole(path) as file:
+        file.write(content.SerializeToString())
+
+
+def require_onnx() -> Any:
+    """Return the module onnx, if it is installed."""
+    return require_extra("onnx", "fit", "ONNX files need")
 
 
 def _require_onnx(model: Model | None) -> None:
@@ -98,38 +115,67 @@ def _require_onnx(model: Model | None) -> None:
         )
 
 
-def _next_state(z: GraphValue, model: Any) -> tuple[GraphValue, int, int]:
+class _Graph:
+    """Operations on named rows of numbers; arrays become constants, which are broadcast."""
+
+    def __init__(self) -> None:
+        self.onnx = require_onnx()
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+
+    def __call__(self, kind: str, *operands: str | Array) -> str:
+        """Add an operation of ONNX, and return the name of its result."""
+        names = [each if isinstance(each, str) else self._constant(each) for each in operands]
+        result = f"value_{len(self.nodes)}"
+        self.nodes.append(self.onnx.helper.make_node(kind, names, [result]))
+        return result
+
+    def _constant(self, values: Array) -> str:
+        name = f"constant_{len(self.constants)}"
+        self.constants.append(self.onnx.numpy_helper.from_array(np.asarray(values), name))
+        return name
+
+    def squared_distances(self, rows: str, centres: Array, scales: Array, factor: float = 1.0) -> str:
+        """Return ``factor |(z - c) / l|^2`` for each centre c, which rounding must not make negative."""
+        inverse = factor / scales**2
+        mixed = self("Gemm", rows, (-2 * inverse * centres).T, (inverse * centres**2).sum(axis=1))
+        of_rows = np.repeat(inverse[:, None], len(centres), axis=1), np.zeros(len(centres))
+        return self("Relu", self("Add", mixed, self("Gemm", self("Mul", rows, rows), *of_rows)))
+
+
+def _next_state(graph: _Graph, z: str, model: Any) -> tuple[str, int, int]:
     """Return the next state of a model at ``z = (x, u)``, and the numbers of states and inputs."""
     if isinstance(model, Corrected):
-        before, n, m = _next_state(z, model.model)
-        return before + _correction(z, model.correction), n, m
+        before, n, m = _next_state(graph, z, model.model)
+        return graph("Add", before, _correction(graph, z, model.correction)), n, m
     if isinstance(model, Linear):
         n, m = model.B.shape
-        return z.affine(np.concatenate([model.A, model.B], axis=1).T, model.c), n, m
+        return graph("Gemm", z, np.concatenate([model.A, model.B], axis=1).T, model.c), n, m
     scaling = model.scaling
     n, width = len(scaling.shift_out), len(scaling.shift_in)
-    h = z.affine(np.diag(1 / scaling.scale_in), -scaling.shift_in / scaling.scale_in)
+    h = graph("Gemm", z, np.diag(1 / scaling.scale_in), -scaling.shift_in / scaling.scale_in)
     if isinstance(model, FeedforwardReLU):
         *layers, last = zip(model.weights, model.biases, strict=True)
         for weight, bias in layers:
-            h = h.affine(weight, bias).node("Relu")
-        change = h.affine(*last).affine(np.diag(scaling.scale_out), scaling.shift_out)
+            h = graph("Relu", graph("Gemm", h, weight, bias))
+        change = graph("Gemm", graph("Gemm", h, *last), np.diag(scaling.scale_out), scaling.shift_out)
     else:
-        half = h.squared_distances(model.centres, model.covariance.length_scales, 0.5)
+        half = graph.squared_distances(h, model.centres, model.covariance.length_scales, 0.5)
         weights = model.covariance.variance * model.weights * scaling.scale_out
-        change = half.node("Neg").node("Exp").affine(weights, scaling.shift_out)
-    return z.affine(np.eye(width)[:, :n], np.zeros(n)) + change, n, width - n
+        change = graph("Gemm", graph("Exp", graph("Neg", half)), weights, scaling.shift_out)
+    return graph("Add", graph("Gemm", z, np.eye(width)[:, :n], np.zeros(n)), change), n, width - n
 
 
-def _correction(z: GraphValue, given: Correction) -> GraphValue:
+def _correction(graph: _Graph, z: str, given: Correction) -> str:
     """Return ``clip(k(z) W + linear) * exp(-1/2 |beyond / fade|^2)``, as :class:`ctxval.models.Correction` does."""
-    pair = z.affine(np.diag(1 / given.scale), -given.shift / given.scale)
-    r2 = pair.squared_distances(given.centres, given.length_scales, 5.0)
-    r = r2.node("Sqrt")
-    covariances = (r + r2 * np.array([1 / 3]) + np.array([1.0])) * r.node("Neg").node("Exp")
-    kernels = covariances.affine(given.weights, np.zeros(given.states))
-    linear = pair.affine(*np.split(given.linear, [-1]))
-    limited = (kernels + linear).node("Min", given.limit).node("Max", -given.limit)
-    beyond = pair.node("Sub", pair.node("Min", given.high).node("Max", given.low))
-    far = beyond.squared_distances(np.zeros((1, len(given.fade))), given.fade, 0.5)
-    return limited * far.node("Neg").node("Exp")
+    pair = graph("Gemm", z, np.diag(1 / given.scale), -given.shift / given.scale)
+    r2 = graph.squared_distances(pair, given.centres, given.length_scales, 5.0)
+    r = graph("Sqrt", r2)
+    polynomial = graph("Add", graph("Add", r, graph("Mul", r2, np.array([1 / 3]))), np.array([1.0]))
+    covariances = graph("Mul", polynomial, graph("Exp", graph("Neg", r)))
+    kernels = graph("Gemm", covariances, given.weights, np.zeros(given.states))
+    linear = graph("Gemm", pair, *np.split(given.linear, [-1]))
+    limited = graph("Max", graph("Min", graph("Add", kernels, linear), given.limit), -given.limit)
+    beyond = graph("Sub", pair, graph("Max", graph("Min", pair, given.high), given.low))
+    far = graph.squared_distances(beyond, np.zeros((1, len(given.fade))), given.fade, 0.5)
+    return graph("Mul", limited, graph("Exp", graph("Neg", far)))
