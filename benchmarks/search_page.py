@@ -118,7 +118,7 @@ def targets() -> list[Target]:
 
 TARGETS = ["case", "within", "target", "median", "25 to 75 %", "worst seed", "reached", "CPU s", "met"]
 LEFT_TO_THE_TABLE = {f"linear-{n}" for n in (2, 3, 4, 6, 7, 8, 9)}
-"""Cases of which the page shows no rows; it shows no targets of all seeds that medians make superfluous, either."""
+"""Cases of which the page shows no rows."""
 
 
 def target_rows(*, short: bool) -> list[list[str]]:
