@@ -107,12 +107,9 @@ def run(tree: Path, *command: str, cwd: Path | None = None) -> subprocess.Comple
 
 
 def exported(text: str, line: str) -> str:
-    """Return an ``__init__.py`` with an import and its name in ``__all__``, or with a line of NAMES."""
-    if line.startswith("from "):
-        name = line.split()[-1]
-        text = text.replace("\nfrom ctxval.", f"\n{line}from ctxval.", 1)
-        return text.replace("__all__ = [", f'__all__ = ["{name}", ', 1)
-    return re.sub(r"(^NAMES[^\n]*\{\n)", lambda found: found[0] + line, text, count=1, flags=re.MULTILINE)
+    """Return an ``__init__.py`` with an import and its name in ``__all__``."""
+    text = text.replace("\nfrom ctxval.", f"\n{line}from ctxval.", 1)
+    return text.replace("__all__ = [", f'__all__ = ["{line.split()[-1]}", ', 1)
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +136,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_there_is_a_recipe_for_each_of_these() -> None:
-    assert set(RECIPES) == {"search", "distance", "synthesizer", "system", "certificate", "case"}
+    assert set(RECIPES) == {"search", "distance", "synthesizer", "system", "certificate"}
 
 
 @pytest.mark.parametrize("part", RECIPES)
@@ -190,7 +187,7 @@ def checked(tree: Path, folder: Path) -> dict[str, tuple[int, str, str]]:
     (folder / "my_rig.py").write_text(MY_RIG)
     (folder / "check_all.py").write_text(CHECK_ALL)
     for part, recipe in RECIPES.items():
-        content = recipe.toml if part == "case" else {**WHOLE, **recipe.toml}
+        content = {**WHOLE, **recipe.toml}
         (folder / f"{part}.toml").write_text("".join(f"{key} = {written(value)}\n" for key, value in content.items()))
     done = run(tree, "check_all", str(tree / PARTS), *RECIPES, cwd=folder)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -206,8 +203,8 @@ def test_parts_are_found_in_experiment_files_and_in_the_page(tree: Path, tmp_pat
         status, said, problems = said_of[part]
         assert status == 0, said + problems
         assert json.loads(said)["ok"]
-        table = recipe.toml.get(part, recipe.toml)
-        name = table.get("type") or table.get("name") or table.get("kind") or table["experiment"]
+        table = recipe.toml[part]
+        name = table.get("type") or table.get("name") or table["kind"]
         assert f"| `{name}` |" in (tree / "docs" / "parts.md").read_text()
         assert f"| `{name}` |" not in (ROOT / "docs" / "parts.md").read_text()
     own = [recipe.test for recipe in RECIPES.values()]
