@@ -7,8 +7,6 @@ sampling MPC does; in a batch, one call serves all tasks. A share above 1.2 is o
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval import Campaign, Task, TaskSpace, Validation, distances, systems
+from ctxval import Campaign, Task, TaskSpace, Validation, distances
 from ctxval._util.arrays import Array
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.trials import TrialRecorder

@@ -51,7 +51,7 @@ from ctxval import (
 )
 from ctxval._util import representation
 from ctxval._util.describe import describe
-from ctxval._util.representation import LINES, LONGEST, ShortRepr, shown
+from ctxval._util.representation import WIDTHS, ShortRepr, shown
 from ctxval.certificates import Certificate, Sample
 from ctxval.core.trial import Change
 from ctxval.errors import InputError
@@ -450,8 +450,8 @@ CLASSES = dict(public_classes())
 
 def require_readable(text: str) -> None:
     """Check what holds for every object, whatever is in it."""
-    assert len(text.splitlines()) <= LINES
-    assert len(text) <= LONGEST
+    assert len(text.splitlines()) <= WIDTHS.lines
+    assert len(text) <= WIDTHS.whole
     assert " at 0x" not in text
     assert "array(" not in text
     assert text.replace("\n", "").isprintable()

@@ -39,7 +39,7 @@ from strangers_reporting import REPORTING  # noqa: E402
 
 ENTRIES = strangers_truths.ENTRIES
 STORED = strangers_truths.TRUTHS
-NARROW = [name for name, entry in ENTRIES.items() if entry.family in ("task", "contact", "unvisited_region")]
+NARROW = [name for name, entry in ENTRIES.items() if entry.family in ("task", "contact", "pocket")]
 REGULAR = [name for name, entry in ENTRIES.items() if not entry.misleading]
 OF_PROCESSOR = {"far-manipulator", "far-barge"}
 """Entries whose models are Gaussian processes, which are others on other processors: learning amplifies rounding."""
@@ -66,7 +66,7 @@ def test_both_halves_have_every_family_and_share_no_system() -> None:
     counts = Counter(entry.family for entry in ENTRIES.values())
     assert min(counts.values()) >= 3
     assert counts["task"] >= 6
-    assert counts["contact"] + counts["unvisited_region"] >= 5
+    assert counts["contact"] + counts["pocket"] >= 5
 
 
 @pytest.mark.thorough
