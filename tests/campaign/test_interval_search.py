@@ -45,7 +45,7 @@ from ctxval.certificates import (
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, hypercube_in, share_missed
-from ctxval.core.coverage import UnvisitedRegion
+from ctxval.core.coverage import UntestedRest, UnvisitedRegion
 from ctxval.errors import InputError
 from ctxval.learning import dynamics_study
 from ctxval.learning.dynamics_posterior import condition
@@ -366,6 +366,9 @@ def test_what_is_executed_next_depends_on_what_stands_in_the_way() -> None:
     place = replace(covered, unvisited_region=UnvisitedRegion(0.3, {"x": 1.0, "y": 1.0}, {"x": 0.3, "y": 0.3}, tasks))
     assert asked(place, known, 2.0, best=0.2) == [0.2, 0.6]
     assert asked(place, np.array([[0.2, 0.6]]), 2.0, best=0.2) == [0.1, 0.7]
+    rest = UntestedRest(0.3, {"x": 0.5}, 0.6, 0.7, 3.0, 2.5, tasks)
+    assert asked(replace(tested, untested_rest=rest), known, 2.0, best=0.9) == [0.2, 0.6]
+    assert asked(replace(tested, untested_rest=rest), known, 2.5, best=0.9) == at_bound.tolist()
     # Every third execution explores, and no task is executed twice.
     assert asked(contested, np.tile(known, (2, 1)), 0.5) == farthest.tolist()
     assert asked(contested, np.array([[0.9, 0.9], [0.8, 0.8], [0.7, 0.7], farthest]), 2.0) == at_bound.tolist()
@@ -396,6 +399,10 @@ def test_friction_at_rest_is_tried_at_the_least_that_nears_the_limit() -> None:
     known = np.array([[0.9, 0.05], [0.05, 0.9], [0.5, 0.5]])
     assert asked(rubbing, known, 0.95, best=0.6) == least.tolist()
     assert asked(replace(rubbing, friction={}), known, 0.95, best=0.6) != least.tolist()
+    moved = CandidateFilter(at_untested_rest=lambda task: task[::-1])
+    point = next_task(replace(rubbing, best=0.6, threshold=0.95), known, moved)
+    assert point is not None
+    assert point.tolist() == least[::-1].tolist()
     # If friction is known, every third execution leads farthest from the records only while they leave gaps.
     gap = StateInputGap(0.0, ("x[0]",), {"x[0]": 0.0})
     covered = replace(rubbing, coverage=replace(rubbing.coverage, beyond=gap, marginal=gap, pair=gap))

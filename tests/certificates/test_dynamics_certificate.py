@@ -29,7 +29,7 @@ from ctxval.certificates.bounds import NO_UNITS
 from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.sentences.verdicts import undecided
 from ctxval.certificates.verdict import judge, judge_by
-from ctxval.core.coverage import UnvisitedRegion
+from ctxval.core.coverage import UntestedRest, UnvisitedRegion
 from ctxval.core.learned_numbers import PushedDistances
 from ctxval.errors import CertificateError
 from rig_evidence import COVERED, GOOD, gap, prediction
@@ -346,6 +346,22 @@ def test_a_place_of_a_position_that_no_execution_has_entered_withdraws_the_bound
     small = replace(evidence, unvisited_region=replace(pocket, size=0.1))
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(small)))
     assert verdict.answer == "validated"
+
+
+def test_a_stretch_where_friction_at_rest_is_untested_withdraws_a_bound_that_it_could_exceed() -> None:
+    rest = UntestedRest(0.3, {"x [m]": 0.5}, 0.6, 0.7, 3.0, 2.0, ((0.5, 0.6), (0.1, 0.2)))
+    evidence = replace(GOOD, untested_rest=rest)
+    known = Evidence.from_json(json.loads(json.dumps(evidence.to_json())))
+    assert known is not None
+    assert known.untested_rest == rest
+
+    def answer(rest: UntestedRest) -> str:
+        learned = Learned(replace(GOOD, untested_rest=rest))
+        return judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=learned)).answer
+
+    assert answer(rest) == "undecided"
+    assert answer(replace(rest, size=UntestedRest.MOST)) == "validated"
+    assert answer(replace(rest, highest=1.35)) == "validated"
 
 
 def test_a_validation_names_the_largest_box_of_two_parameters_without_an_execution() -> None:

@@ -277,6 +277,7 @@ class CampaignDynamics:
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
             actuator=None if actuator is None else (actuator.delay, actuator.lag),
             friction=learned.friction,
+            untested_rest=learned.untested_rest,
             physical=learned.study.given.physical,
             without_data=not learned.with_data,
             estimated=learned.study.given.outputs is not None,

@@ -229,8 +229,8 @@ class IntervalSearch:
         lacks_tests = remedy.kind == "drawn"
         if isinstance(kind, Automatic) and evidence.quantile is None and self._suite is None:
             chosen = sum(trial.origin not in DRAWN for trial in trials)
-            in_a_region = any(opened.code == "unvisited_region" for opened in open_checks(evidence))
-            if chosen >= 16 and not lacks_tests and not in_a_region:
+            in_places = any(opened.code in ("unvisited_region", "untested_rest") for opened in open_checks(evidence))
+            if chosen >= 16 and not lacks_tests and not in_places:
                 return self._by_distance()
             covers = not evidence.negligible and covering(self._points(trials), kind.resolution, 0) is not None
             if covers and self._by_distance() is None:
@@ -252,7 +252,8 @@ class IntervalSearch:
         new = CandidateFilter(self._near, steady)
         # Tasks that differ in parameters that change no prediction are one task, with values that are spread.
         if learned is not None and self._suite is None:
-            new = CandidateFilter(self._near, steady, learned.spread_unseen, learned.study.seen_parameters)
+            moved = learned.spread_unseen, learned.study.seen_parameters, learned.at_untested_rest
+            new = CandidateFilter(self._near, steady, *moved)
         point = next_task(evidence, known, new)
         if len(waiting) and (point is None or np.abs(waiting - point)[:, new.seen].max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.

@@ -230,6 +230,14 @@ def _unsupported(evidence: Evidence) -> Gap | None:
     return Gap(-ratio, values, -evidence.limits.supported)
 
 
+def _untested_rest(evidence: Evidence) -> Gap | None:
+    rest = evidence.untested_rest
+    if rest is None or rest.highest <= (evidence.raised if evidence.threshold is None else evidence.threshold):
+        return None
+    values = {"place": with_units(rest.place), "length": radius_of(dict.fromkeys(rest.place, rest.length))}
+    return Gap(rest.size, {**values, "times": rest.times, "highest": rest.highest})
+
+
 # Measures: the search
 
 
@@ -325,6 +333,12 @@ def _at_the_corner(evidence: Evidence, known: int) -> Remedy:
 def _in_the_region(evidence: Evidence, known: int) -> Remedy:
     region = evidence.unvisited_region
     return _beyond_the_records(evidence, known, *([] if region is None else [np.array(region.tasks)]))
+
+
+def _in_the_stretch(evidence: Evidence, known: int) -> Remedy:
+    rest = evidence.untested_rest
+    tasks = [] if rest is None or not rest.tasks else [np.array(rest.tasks)]
+    return Remedy((*tasks, *in_turn(evidence, known).tasks))
 
 
 def in_turn(evidence: Evidence, known: int) -> Remedy:
@@ -569,6 +583,15 @@ CHECKS = (
         "",
         "A prediction that failed leaves only thresholds credible that are far above the bound.",
         _past_a_failed_prediction,
+    ),
+    Check(
+        "untested_rest",
+        "tests",
+        "rest_gap",
+        _untested_rest,
+        sentences.UNTESTED_REST,
+        "A detent holds a joint that rests there, and no run that slides past it or leaves it fast shows that.",
+        _in_the_stretch,
     ),
     Check(
         "unexplained",

@@ -174,6 +174,7 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
         "share_supported": share_supported(evidence.executions, above, confidence) if is_noisy else None,
         "variance_left_out": evidence.left_out,
         "unvisited_region": evidence.unvisited_region and asdict(evidence.unvisited_region),
+        "untested_rest": evidence.untested_rest and asdict(evidence.untested_rest),
         "empty_box": None if empty is None else asdict(empty),
         "pushed": evidence.pushed and evidence.pushed.to_json(),
         "differing": None if differing is None else [sample.numbers[row] for row in differing],

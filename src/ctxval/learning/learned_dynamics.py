@@ -13,7 +13,7 @@ from scipy.spatial.distance import cdist
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import parted
-from ctxval.core.coverage import StateInputCoverage, UnsampledParameter, UnvisitedRegion
+from ctxval.core.coverage import StateInputCoverage, UnsampledParameter, UntestedRest, UnvisitedRegion
 from ctxval.core.labels import labels_of
 from ctxval.core.learned_numbers import PushedDistances
 from ctxval.core.model import Model, predicted_steps, with_memory
@@ -32,6 +32,7 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.regular import Boundary, RegularTransitions
+from ctxval.learning.rest_places import RestPlaces, rest_places, untested_rest
 from ctxval.learning.tolerance import push_response
 from ctxval.learning.worst_case import WorstCase
 
@@ -254,6 +255,32 @@ class LearnedDynamics(ShortRepr):
         rows, finite = np.concatenate([each.ravel() for each in steps]), np.isfinite(visited).all(axis=1)
         executed, labels = self.trajectories_of_system, self.labels[:states]
         return largest_pocket(visited[finite], executed, labels, self.positions, rows[finite], pool)
+
+    @functools.cached_property
+    def _rest_places(self) -> list[RestPlaces]:
+        """Where the friction at rest of each joint is tested, and where predicted runs need it."""
+        planner, search = self.study.planner, self.study.search
+        if self.posterior.pushes is None:
+            return []
+        with single_threaded(), np.errstate(all="ignore"):
+            return rest_places(self.posterior, planner, search.pool, search.plans, self._pool_loops)
+
+    @functools.cached_property
+    def untested_rest(self) -> UntestedRest | None:
+        """The longest stretch of places where friction at rest was not tested; None without such friction."""
+        with single_threaded(), np.errstate(all="ignore"):
+            return untested_rest(self._rest_places, self.labels, self._rng(7))
+
+    def at_untested_rest(self, task: Array) -> Array | None:
+        """Return a task ``(d,)`` that leaves rest under the force of another one where friction at rest is untested.
+
+        It is None if the other task tests no place, or if there is none.
+        """
+        if self.untested_rest is None or self.untested_rest.size <= UntestedRest.MOST:
+            return None
+        worst = max(self._rest_places, key=lambda each: each.widest[0])
+        with single_threaded(), np.errstate(all="ignore"):
+            return worst.like(task, self._rng(8))
 
     @property
     def unsampled_parameter(self) -> UnsampledParameter | None:
