@@ -13,7 +13,7 @@ from scipy.spatial.distance import cdist
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import parted
-from ctxval.core.coverage import REST_GAP, StateInputCoverage, UnsampledParameter, UntestedRest, UnvisitedRegion
+from ctxval.core.coverage import StateInputCoverage, UnsampledParameter, UntestedRest, UnvisitedRegion
 from ctxval.core.labels import labels_of
 from ctxval.core.learned_numbers import PushedDistances
 from ctxval.core.model import Model, predicted_steps, with_memory
@@ -313,7 +313,7 @@ class LearnedDynamics(ShortRepr):
 
         It is None if the other task tests no place, or if there is none.
         """
-        if self.untested_rest is None or self.untested_rest.size <= REST_GAP:
+        if self.untested_rest is None or self.untested_rest.size <= UntestedRest.MOST:
             return None
         worst = max(self._rest_places, key=lambda each: each.widest[0])
         with single_threaded(), np.errstate(all="ignore"):
