@@ -29,7 +29,7 @@ from ctxval.certificates.bounds import NO_UNITS
 from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.sentences.verdicts import undecided
 from ctxval.certificates.verdict import judge, judge_by
-from ctxval.core.coverage import REST_GAP, UntestedRest, UnvisitedRegion
+from ctxval.core.coverage import UntestedRest, UnvisitedRegion
 from ctxval.core.learned_numbers import PushedDistances
 from ctxval.errors import CertificateError
 from rig_evidence import COVERED, GOOD, gap, prediction
@@ -360,7 +360,7 @@ def test_a_stretch_where_friction_at_rest_is_untested_withdraws_a_bound_that_it_
         return judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=learned)).answer
 
     assert answer(rest) == "undecided"
-    assert answer(replace(rest, size=REST_GAP)) == "validated"
+    assert answer(replace(rest, size=UntestedRest.MOST)) == "validated"
     assert answer(replace(rest, highest=1.35)) == "validated"
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from ctxval import Task, TaskSpace, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
-from ctxval.core.coverage import REST_GAP
+from ctxval.core.coverage import UntestedRest
 from ctxval.learning import DynamicsStudy
 from ctxval.learning.learned_dynamics import LearnedDynamics
 
@@ -74,7 +74,7 @@ def test_a_place_is_tested_by_a_joint_that_leaves_rest_there_under_a_small_force
     assert rest.times * HOLDS / 3.2 < rest.highest < 3 * rest.times * HOLDS  # what is held stays short of its goal
     filled = learned(tuple(np.linspace(-1, 1, 21).tolist())).untested_rest
     assert filled is not None
-    assert filled.size <= REST_GAP
+    assert filled.size <= UntestedRest.MOST
     assert filled.tasks == ()
 
 

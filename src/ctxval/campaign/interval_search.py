@@ -118,6 +118,8 @@ class IntervalSearch:
         trials = self.recorder.trials
         if not self.recorder.has_tasks:
             return None
+        if self.recorder.predicts:  # what only reads a store chooses as the stored speed allows
+            self.recorder.dynamics.thinking.measure(trials)
         if self.threshold is not None and any(trial.least > self.threshold for trial in trials):
             repeated = self._against_noise()
             if repeated is not None or self.is_falsified:
@@ -209,7 +211,9 @@ class IntervalSearch:
         rule = StoppingRule(self.limit, self.options.confidence, kind.resolution)
         now = rule.decide(self.recorder.trials, self.budget - self.recorder.trials.executions)
         if not now.decided:
-            return Choice(now.next_point, "covering", planned_draws=0)
+            # Whether the task is steady is not tested if there is no time for closed loops.
+            rejected = 0 if self.recorder.dynamics.has_no_time(self.recorder.trials) else None
+            return Choice(now.next_point, "covering", planned_draws=0, rejected=rejected)
         missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self.recorder.trials.ended))
         return self.test() if missing else None
 
@@ -225,8 +229,8 @@ class IntervalSearch:
             decides = not open_checks(evidence)
         if decides:
             whole = dynamics.evidence(trials, confidence, keep=self.keeps)
-            if whole is None:
-                return self._by_distance()
+            if whole is None:  # more executions do not help if time is short
+                return None if dynamics.shortage is not None else self._by_distance()
             evidence = self._asked(whole)
             with suppress(CertificateError):
                 sample = replace(Sample.of(trials.ended), threshold=self.limit)
@@ -246,7 +250,10 @@ class IntervalSearch:
             covers = not evidence.negligible and covering(self._points(trials), kind.resolution, 0) is not None
             if covers and self._by_distance() is None:
                 return None
-        return self.test() if lacks_tests else self._by_evidence(evidence)
+        ledger = dynamics.ledger(trials)
+        ledger.charge("loops", lambda costs: costs.next_task())
+        with ledger.spending("loops"):
+            return self.test() if lacks_tests else self._by_evidence(evidence)
 
     def _first_remedy(self, evidence: Evidence) -> Remedy:
         """Return what the first open check needs that an execution can close; tasks of a suite are executed once."""
@@ -263,7 +270,7 @@ class IntervalSearch:
         new = CandidateFilter(self._near, steady)
         # Tasks that differ in parameters that change no prediction are one task, with values that are spread.
         if learned is not None and self._suite is None:
-            moved = learned.spread_unseen, learned.study.seen_parameters, learned.at_untested_rest
+            moved = learned.spread_unseen, learned.seen_parameters, learned.at_untested_rest
             new = CandidateFilter(self._near, steady, *moved)
         point = next_task(evidence, known, new)
         if len(waiting) and (point is None or np.abs(waiting - point)[:, new.seen].max(axis=1).min() <= NEAR):

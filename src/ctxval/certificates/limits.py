@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ctxval.core.coverage import REST_GAP
+from ctxval.core.coverage import UntestedRest
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class CheckLimits:
     contradicted: float = 5.0  #: e-value of all executions against the noise; true noise exceeds it in 1 of 100
     leverage: float = 0.5  #: least predicted share of the bound from which an execution tells of the threshold
     drifting: float = 0.005  #: p-value below which effects of executions change with their order or with a parameter
-    rest_gap: float = REST_GAP  #: stretch in which friction at rest is not tested, as a share of the range of joints
+    rest_gap: float = UntestedRest.MOST  #: stretch without a test of friction at rest, as a share
     uneven: float = 1.5  #: ratio of a force that a joint at rest withstood to one that moved it elsewhere
     supported: float = 1.0  #: least likelihood ratio of the noise against a share of executions above the threshold
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
@@ -63,16 +64,14 @@ class UnsampledParameter(ShortRepr):
     idle: bool = False  #: whether a parameter of this kind changes no predicted distance either; not of a suite
 
 
-REST_GAP = 0.105
-"""Longest stretch in which friction at rest is not tested, as a share of the range in which joints leave rest."""
-
-
 @dataclass(frozen=True)
 class UntestedRest:
     """The longest stretch of places in which no execution tested friction at rest.
 
     An execution tests a place if a joint leaves rest there under a force that is little above usual friction at rest.
     """
+
+    MOST: ClassVar[float] = 0.105  #: the largest size that is allowed: nine tested places leave 10 %
 
     size: float  #: its length, as a share of the range in which joints leave rest
     place: dict[str, float]  #: a place in it, by the label of the joint's coordinate, in its unit

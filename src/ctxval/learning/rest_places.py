@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
-from ctxval.core.coverage import REST_GAP, UntestedRest
+from ctxval.core.coverage import UntestedRest
 from ctxval.core.trajectory import Transitions
 from ctxval.learning.closed_loops import LoopPlanner, Loops, PlannedTasks
 from ctxval.learning.dry_friction import DryFriction
@@ -115,7 +115,7 @@ class RestPlaces:
     @property
     def aim(self) -> tuple[float, float]:
         """A place in this stretch from which fewest departures fill it, and a force that tests the place."""
-        place, most = float(self.needed.places[self.widest[1]]), REST_GAP * self.width
+        place, most = float(self.needed.places[self.widest[1]]), UntestedRest.MOST * self.width
         tested = self.left.places[self.left.forces <= self.allowed]
         low = tested[tested <= place].max(initial=self.needed.places.min())
         high = tested[tested >= place].min(initial=self.needed.places.max())
@@ -129,7 +129,7 @@ class RestPlaces:
 
         It is empty if no such task is found.
         """
-        scale = SETTINGS.apart * REST_GAP * self.width
+        scale = SETTINGS.apart * UntestedRest.MOST * self.width
 
         def missed(found: Departures, count: int) -> Array:
             least = np.full(count, np.inf)
@@ -254,7 +254,7 @@ def untested_rest(places: Sequence[RestPlaces], labels: Sequence[str], rng: np.r
     strong = replace(mean, model=replace(mean.model, rest=rest))
     tasks: Array = np.empty((0, worst.pool.shape[1]))
     highest = np.inf
-    if size > REST_GAP:
+    if size > UntestedRest.MOST:
         distances = planner.distances(strong, planner.plan(worst.pool), len(worst.pool))
         highest = float(np.nanmax(distances, initial=0.0))
         tasks = np.concatenate([worst.tasks(*worst.aim, rng), worst.pool[worst.needed.rows[[row]]]])
