@@ -28,7 +28,7 @@ from ctxval.certificates.bounds import Quantities, with_units
 from ctxval.certificates.checks import Remedy, open_checks
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
-from ctxval.certificates.explained import LEVERAGE
+from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import DistanceBound
 from ctxval.certificates.prediction_tests import DRAWN, HYPERCUBE, MANY, TESTS, hypercube_in
@@ -39,8 +39,17 @@ from ctxval.core.trial import Trial, Trials
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.worst_case import is_kinked
 
-_HYPERCUBES = 128  # from which the one that is executed is chosen
-_FAR = 10.0  # multiple of what is known or allowed from which a predicted distance is said to be dangerous
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How tests are chosen, and of what a choice warns."""
+
+    hypercubes: int = 128  #: from which the one that is executed is chosen
+    far: float = 10.0  #: multiple of what is known or allowed from which a predicted distance is said to be dangerous
+
+
+SEARCH = SearchSettings()
+"""The settings in use."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +160,10 @@ class IntervalSearch:
         learned, needed = self.recorder.dynamics.learned(self.recorder.trials), min(self.tests, TESTS)
         if learned is None:
             return 0, 1.0
-        tasks = np.stack([self.recorder.draws.hypercube(number, k)[:needed] for k in range(_HYPERCUBES)])
-        is_large = learned.near_pool(tasks.reshape(-1, tasks.shape[2])) >= LEVERAGE * learned.worst_of_mean.highest
+        tasks = np.stack([self.recorder.draws.hypercube(number, k)[:needed] for k in range(SEARCH.hypercubes)])
+        is_large = (
+            learned.near_pool(tasks.reshape(-1, tasks.shape[2])) >= LIMITS.leverage * learned.worst_of_mean.highest
+        )
         large = is_large.reshape(tasks.shape[:2]).sum(axis=1)
         alike = large >= min((needed + 1) // 2, large.max())
         return int(alike.argmax()), float(alike.mean())
@@ -354,7 +365,7 @@ def with_next_task(verdict: Verdict, recorder: TrialRecorder, options: Certifica
     space = recorder.validation.space
     point = space.from_unit(space.rounded(choice.unit_point))
     task, learned = with_units(space.labelled(point)), recorder.dynamics.learned(recorder.trials)
-    far = _FAR * max(search.best, search.limit)
+    far = SEARCH.far * max(search.best, search.limit)
     if learned is not None and not learned.expected(choice.unit_point[None])[0] <= far:
         task = f"(caution: its predicted run goes far beyond all others; be ready to stop it) {task}"
     reason = f"{verdict.reason.removesuffix('.')}; next task: {task}."
