@@ -32,8 +32,6 @@ from ctxval.core.coverage import StateInputGap
 
 Stage = Literal["learning", "coverage", "tested", "tests", "explained", "search", "support", "bound"]
 
-_NEARS = 0.7  # share of the way from the largest executed distance to the limit from which a draw is near it
-_TIMES = 4  # executions of a task that are chosen because one execution does not explain it
 _SAME = 1e-9  # largest difference of the coordinates of two executions of one task
 
 
@@ -291,7 +289,7 @@ def _draws(evidence: Evidence) -> Array:
     """
     order, rank = np.argsort(evidence.maxima, kind="stable"), evidence.rank
     if evidence.friction and evidence.threshold is not None:
-        near = evidence.best + _NEARS * (evidence.threshold - evidence.best)
+        near = evidence.best + evidence.limits.near * (evidence.threshold - evidence.best)
         first = int(np.searchsorted(evidence.maxima[order], near, side="right"))
         return evidence.points[[*order[first:], *order[:first][::-1]]]
     return evidence.points[[*order[rank::-1], *order[:rank:-1]]]
@@ -386,7 +384,7 @@ def _least_explained(evidence: Evidence, known: int) -> Remedy:
     assert least is not None
     task = np.array(least.point)
     times = sum(np.abs(np.array(each.point) - task).max() <= _SAME for each in evidence.executed)
-    return Remedy((task[None],), "again") if times < _TIMES else Remedy()
+    return Remedy((task[None],), "again") if times < evidence.limits.repetitions else Remedy()
 
 
 CHECKS = (

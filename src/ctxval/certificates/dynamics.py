@@ -148,6 +148,7 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
         "error": error,
         "executions": evidence.executions,
         "draws": len(evidence.maxima),
+        **({"thinking": {"replaced": list(evidence.replaced)}} if evidence.replaced else {}),
         "largest_draw": float(finite.max()) if len(finite) == len(evidence.maxima) else None,
         "median_draw": float(np.median(finite)) if len(finite) else None,
         "evaluations": evidence.evaluations,

@@ -68,6 +68,7 @@ class Evidence(ShortRepr):
     untested_rest: UntestedRest | None = None  #: where friction at rest was not tested; None without dry friction
     #: the largest distance under errors of M as small as all that were recorded; 0 if such errors are learned
     negligible: float = 0.0
+    replaced: tuple[str, ...] = ()  #: stages that were left out, or replaced by cheaper ones, for lack of time
     # The question
     best: float = 0.0  #: the largest executed distance
     worst: tuple[float, ...] = ()  #: its task, a point of the unit cube ``(d,)``; empty if it is not known
