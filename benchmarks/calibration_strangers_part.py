@@ -45,8 +45,8 @@ threshold, and only diagnostics prevented a validation. Each of these was the on
 
 {diagnostics}
 
-The others never were: {silent}. Whether other systems need them is not known ([all
-diagnostics](tables/calibration-diagnostics.csv)).
+These spoke, and never alone: {silent}. The remaining ones did not speak; some are newer than the campaigns. Whether
+other systems need them is not known ([all diagnostics](tables/calibration-diagnostics.csv)).
 
 ### Rules that were tried and not adopted
 
@@ -85,7 +85,7 @@ def of_strangers() -> tuple[str, dict[str, Table]]:
         steps=f"{sum(len(by) > 0 for line in known for _, by in line['stopped']):,}",
         campaigns=f"{len(known):,}",
         diagnostics=table(DIAGNOSTICS, [row for row in diagnostics if row[2] != "0"]),
-        silent=", ".join(row[0] for row in diagnostics if row[2] == "0"),
+        silent=", ".join(row[0] for row in diagnostics if row[1] != "0" and row[2] == "0"),
     )
     return text, {
         "calibration-strangers": (ANSWERS, answers),
