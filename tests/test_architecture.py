@@ -12,7 +12,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-from source_counts import numeric_constants
+from source_counts import counts_of_tests, numeric_constants, sentence_assertions
 
 SOURCE = Path(__file__).parents[1] / "src" / "ctxval"
 ARCHITECTURE = Path(__file__).parents[1] / "docs" / "architecture.md"
@@ -32,6 +32,8 @@ CONTROL = {
         "experiment",
     )
 }
+SENTENCES = 80
+"""Assertions on wording: texts have their snapshots, everything else asserts names, values and codes."""
 CONSTANTS = 120  # numbers in capitals that are no settings: tolerances of rounding, formats, layouts; never more
 READ_ONLY = ("campaign.plot", "report")
 EXECUTING = {"execute", "run", "ask", "tell", "outcome", "distances", "plan"}
@@ -158,6 +160,23 @@ def test_tasks_validations_and_stores_are_there_without_the_parts_of_scipy() -> 
 
 def test_numbers_that_decide_are_settings() -> None:
     assert sum(len(numeric_constants(path.read_text())) for path in SOURCE.rglob("*.py")) <= CONSTANTS
+
+
+def test_tests_assert_facts_and_hardly_any_sentence() -> None:
+    assert counts_of_tests(Path(__file__).parent)["assertions on sentences"] <= SENTENCES
+
+
+def test_a_sentence_counts_wherever_a_test_compares_it_and_names_do_not() -> None:
+    text = """
+@pytest.mark.parametrize(("x", "words"), [(1, "it has no end"), (2, "a.csv: x[0]")])
+def test(x, words):
+    assert words in str(x)
+    assert "two words" in f("not an operand of it")
+    with pytest.raises(ValueError, match="must be a number"):
+        refuses(InputError, "dt", -0.1, "the step of time")
+    assert x == "--option of a.toml", "what is wrong with it"
+"""
+    assert [line for line, _ in sentence_assertions(text)] == [2, 6, 7]
 
 
 def test_numbers_tuples_and_arrays_are_constants_and_fields_of_settings_are_not() -> None:

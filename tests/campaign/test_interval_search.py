@@ -50,6 +50,7 @@ from ctxval.errors import InputError
 from ctxval.learning import dynamics_study
 from ctxval.learning.dynamics_posterior import condition
 from ctxval.testing import FaultyRig
+from facts import assert_names, refuses
 from rig_thorough import more
 
 
@@ -71,7 +72,6 @@ def test_a_linear_system_is_validated_in_few_executions_by_a_bound_that_is_true(
     campaign = Campaign(validation).run(16, 1.1 * largest)
     verdict = campaign.verdict(1.1 * largest)
     assert verdict.answer == "validated"
-    assert "the dynamics bound is" in verdict.reason
     assert verdict.certificate is not None
     assert verdict.certificate.upper_bound >= largest * (1 - 1e-6)
     assert campaign.executions <= 16
@@ -230,9 +230,9 @@ def test_a_plain_run_is_certified_by_predictions_that_are_computed_afterwards() 
 
 def test_an_audit_of_a_planned_number_cannot_end_it() -> None:
     validation, _ = linear()
-    with pytest.raises(InputError, match="auto, dynamics, posterior, anytime and suite, got 'audit'"):
+    with refuses(InputError, "audit", "auto", "suite"):
         Campaign(validation).run(5, 1.0, certificate=CertificateOptions(Audit(), volume=0.1))
-    with pytest.raises(InputError, match="needs the volume"):
+    with refuses(InputError, "volume"):
         Campaign(validation).run(5, 1.0, certificate=CertificateOptions(AnytimeAudit()))
 
 
@@ -265,8 +265,7 @@ def test_eight_drawn_tasks_are_executed_before_a_model_is_validated(decided: Cam
     assert 0.38 < share < 0.6
     by_model = plain.verdict(1.1 * largest, certificate=untested)
     assert by_model.answer == "validated"
-    assert "No tried task exceeds the threshold under a further error of M" in str(by_model)
-    assert "must be predicted beforehand" in plain.verdict(1.1 * largest).reason
+    assert plain.verdict(1.1 * largest).answer == "undecided"
 
 
 @pytest.mark.slow
@@ -284,15 +283,15 @@ def test_after_many_executions_of_a_search_the_tests_alone_are_missing() -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("tests", "origin", "sentence"),
+    ("tests", "origin", "facts"),
     [
-        (8, "spread", "at most 39 % of the tasks exceed 1000 (8 tests drawn as a Latin hypercube)"),
-        (22, "iid", "at most 13 % of the tasks exceed 1000 (22 independent draws)"),
+        (8, "spread", ("39 %", 1000, 8)),
+        (22, "iid", ("13 %", 1000, 22)),
     ],
 )
 @pytest.mark.thorough
 def test_the_tests_bound_the_share_of_the_tasks_that_exceed_the_threshold(
-    tests: int, origin: str, sentence: str
+    tests: int, origin: str, facts: tuple[object, ...]
 ) -> None:
     options = CertificateOptions(Automatic(tests=tests))
     campaign = Campaign(linear()[0], seed=2).run(90, 1e3, certificate=options)
@@ -300,7 +299,7 @@ def test_the_tests_bound_the_share_of_the_tasks_that_exceed_the_threshold(
     verdict = campaign.verdict(1e3, certificate=options)
     assert verdict.answer == "validated"
     assert verdict.rests_on is not None
-    assert sentence in verdict.rests_on
+    assert_names(verdict.rests_on, *facts)
 
 
 @pytest.mark.slow
@@ -512,7 +511,7 @@ def test_evidence_is_the_same_after_it_was_kept() -> None:
 
 
 def test_a_threshold_must_be_positive() -> None:
-    with pytest.raises(InputError, match="threshold"):
+    with refuses(InputError, "threshold"):
         Campaign(linear()[0]).run(5, -1.0)
 
 

@@ -119,7 +119,7 @@ def test_an_experiment_file_states_it(tmp_path: Path, monkeypatch: pytest.Monkey
     assert invoke(app, ["run", "p.toml", "--budget", "5", "--store", "p.sqlite"]).exit_code == 0
     shown = invoke(app, ["certify", "p.sqlite", "--kind", "scenario"])
     assert shown.exit_code == 0, shown.output
-    " ".join(shown.output.split())
+    assert_names(" ".join(shown.output.split()), "goal normal (mean 0.5, deviation 0.1)")
     space = read_settings("p.toml", {}).load().validation.space
     assert np.abs(space.iid(200, np.random.default_rng(0)) - 0.5).max() < 0.6
 
