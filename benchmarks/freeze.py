@@ -49,8 +49,6 @@ MOST = {
     "paper": (160, 0.8),
 }
 """Of each group, how many campaigns are kept, the cheapest, and the weight of their cost in the order of running."""
-UNLIMITED = np.inf
-"""Seconds of thinking, so that nothing depends on the speed of a machine."""
 TRUSTED = 64
 """Random tasks of which it is kept whether an envelope trusts them."""
 
@@ -314,7 +312,7 @@ def call(campaign: Campaign, step: Sequence[Any], frozen: Mapping[str, Any], **o
     method, arguments = step
     if method == "run":
         others |= {"threshold": frozen["threshold"], "certificate": options_of(frozen["certificate"])}
-        others["thinking"] = UNLIMITED
+        others |= {"thinking": np.inf}  # results do not depend on the speed of the machine
     getattr(campaign, method)(**arguments, **others)
 
 
@@ -333,7 +331,7 @@ def outcome(campaign: Campaign, frozen: Mapping[str, Any]) -> dict[str, Any]:
         except CertificateError as error:
             certificate, found["answer"], found["reason"] = None, "refused", str(error)
     else:
-        verdict = campaign.verdict(threshold, certificate=options, thinking=UNLIMITED)
+        verdict = campaign.verdict(threshold, certificate=options, thinking=np.inf)
         certificate, found["answer"], found["reason"] = verdict.certificate, verdict.answer, verdict.reason
         found["next"] = None if verdict.next_task is None else dict(verdict.next_task)
         found["witness"] = None if verdict.witness is None else verdict.witness.number

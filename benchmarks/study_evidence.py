@@ -64,7 +64,7 @@ def decide(group: str, system: str, seed: int) -> dict[str, Any]:
         validation = calibrate_noise.ALL[plant](imperfection, seed + 1).validation
     with single_threaded(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        campaign = Campaign(validation, seed=seed).run(BUDGET, threshold)
+        campaign = Campaign(validation, seed=seed).run(BUDGET, threshold, thinking=np.inf)
         verdict = campaign.verdict(threshold)
     return {
         "group": group,

@@ -40,7 +40,7 @@ def study(system: str, share: float, seed: int, looked_for: bool) -> dict[str, A
     if not looked_for:
         DynamicsStudy._with_friction = lambda *_: None  # type: ignore[method-assign,assignment]
     try:
-        campaign = Campaign(SYSTEMS[system]().validation, seed=seed).run(BUDGET, threshold)
+        campaign = Campaign(SYSTEMS[system]().validation, seed=seed).run(BUDGET, threshold, thinking=np.inf)
         verdict = campaign.verdict(threshold)
     finally:
         DynamicsStudy._with_friction = finds  # type: ignore[method-assign]
