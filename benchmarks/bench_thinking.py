@@ -188,6 +188,9 @@ if __name__ == "__main__":
         found["bound"],
         found["reason"],
     )
+    if a.thinking is not None:
+        share = max([*found["choices"], found["verdict"]]) / a.thinking
+        print(f"largest share of the budget: {share:.2f} ({'kept' if share <= MOST else 'NOT KEPT'})")
     print("speed", found["notes"][0] and found["notes"][0]["speed"], found["shortage"])
     for choice, note in zip(found["choices"], found["notes"], strict=False):
         if note and "spent" in note:

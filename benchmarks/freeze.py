@@ -331,7 +331,7 @@ def outcome(campaign: Campaign, frozen: Mapping[str, Any]) -> dict[str, Any]:
         except CertificateError as error:
             certificate, found["answer"], found["reason"] = None, "refused", str(error)
     else:
-        verdict = campaign.verdict(threshold, certificate=options)
+        verdict = campaign.verdict(threshold, certificate=options, thinking=np.inf)
         certificate, found["answer"], found["reason"] = verdict.certificate, verdict.answer, verdict.reason
         found["next"] = None if verdict.next_task is None else dict(verdict.next_task)
         found["witness"] = None if verdict.witness is None else verdict.witness.number
