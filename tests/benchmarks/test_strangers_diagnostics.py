@@ -40,7 +40,7 @@ class Judged:
 def test_the_last_judgement_after_each_execution_counts() -> None:
     dynamics, trials = Judged(), list[Any]()
 
-    def run(budget: int, threshold: float) -> None:
+    def run(budget: int, threshold: float, **options: Any) -> None:
         for _ in range(budget):
             campaign.executions = len(trials)
             judge: Callable[..., Any] = dynamics.screening

@@ -15,6 +15,7 @@ from ctxval._util.progress import Progress, listening
 from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.errors import StoreAccessError
 from ctxval.gp.ascent import usual_effort
+from ctxval.searches.trust_region import TrustRegionSettings
 from facts import refuses
 
 
@@ -63,14 +64,14 @@ def test_an_audit_says_how_many_executions_it_needs() -> None:
 
 @pytest.mark.slow
 def test_choosing_counts_designs_towards_what_is_expected() -> None:
-    campaign = Campaign(make_validation(), search=searches.Auto(100), seed=1).run(2, explore=True)
+    campaign = Campaign(make_validation(), search=searches.Auto("thorough"), seed=1).run(2, explore=True)
     reports = reports_of(lambda: campaign.ask())
     designs = [report for report in reports if report.stage == "choosing a task"]
     assert designs[0].done == 0
     assert [report.done for report in designs] == sorted(report.done for report in designs)
     assert 40 <= designs[-1].done <= 220  # a choice that leaves its region needs two ascents
     expected = {report.expected for report in designs} - {None}
-    usual = usual_effort(1, 100)
+    usual = usual_effort(1, TrustRegionSettings().points)
     assert expected == {usual.exact + usual.rough}
     assert last_of(reports)["predicting the execution"].done > 0
 

@@ -277,6 +277,7 @@ def test_a_noisy_execution_that_matters_most_is_repeated() -> None:
 def test_missing_tests_are_drawn_once_nothing_else_is_open() -> None:
     missing = replace(GOOD, tests=8, threshold=2.0)
     assert (remedy(missing)[0], remedy(missing)[1].kind) == ("tests_missing", "drawn")
+    assert remedy(replace(missing, executions=LIMITS.fewest - 1))[1].kind == "new"  # too little is learned to test it
     assert remedy(replace(missing, unvisited_region=REGION))[0] == "unvisited_region"
     np.testing.assert_array_equal(remedy(replace(missing, unvisited_region=REGION))[1].tasks[0], [[0.1, 0.2]])
 

@@ -79,7 +79,7 @@ def test_a_suite_is_run_to_its_verdict_and_reported_by_the_names_of_its_tasks(fi
     done = calling()("run", str(file), "--store", store)
     assert done.exit_code == 0, done.output
     assert "task='long way'" in done.output
-    assert_names(" ".join(done.output.split()), "all", 3, "suite")
+    assert_names(" ".join(done.output.split()), "VALIDATED", 3, "suite")
     assert report(calling()("certify", store, "--kind", "suite", "--json"))["kind"] == "suite"
     page = Path(store).with_suffix(".report.html").read_text()
     assert all(name in page for name in ("short way", "long way", "back"))

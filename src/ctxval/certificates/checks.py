@@ -340,13 +340,22 @@ def _in_the_stretch(evidence: Evidence, known: int) -> Remedy:
 
 
 def in_turn(evidence: Evidence, known: int) -> Remedy:
-    """Return further tests of the predictions: where a draw is largest and far from the records, in turn."""
+    """Return further tests of the predictions: where a draw is largest and far from the records, in turn.
+
+    While no prediction held at a distance that matters to the threshold, the largest predicted distance comes first.
+    """
+    threshold, limits = evidence.threshold, evidence.limits
+    if threshold is not None and evidence.quantile is None and not evidence.negligible:
+        large = (each for each in evidence.counted(threshold) if each.distance >= limits.matters * threshold)
+        if not any(each.held(threshold, limits) for each in large):
+            return _at_the_largest(evidence, known)
     draws, farthest = _draws(evidence), _farthest(evidence)
     return Remedy((draws, farthest) if known % 2 else (farthest, draws))
 
 
 def _drawn(evidence: Evidence, known: int) -> Remedy:
-    return Remedy(kind="drawn")
+    """Return a drawn task, once enough is learned for predictions of it to be tests."""
+    return in_turn(evidence, known) if evidence.executions < evidence.fewest_executions else Remedy(kind="drawn")
 
 
 def _past_a_failed_prediction(evidence: Evidence, known: int) -> Remedy:
