@@ -125,8 +125,10 @@ def target_rows(*, short: bool) -> list[list[str]]:
     """Return the targets and the measured executions; ``short`` without some linear systems and columns."""
     if not short:
         return [row for target in targets() if (row := target.row())]
-    shown_targets = [target for target in targets() if target.case not in LEFT_TO_THE_TABLE]
-    return [[*row[:6], row[8]] for target in shown_targets if (row := target.row())]
+    shown_targets = [
+        target for target in targets() if target.case not in LEFT_TO_THE_TABLE and not target.asked.endswith("30")
+    ]
+    return [[*row[:5], row[5].split(" (")[0], row[8]] for target in shown_targets if (row := target.row())]
 
 
 def heavy_tail() -> str:

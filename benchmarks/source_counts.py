@@ -2,6 +2,9 @@
 
 ``python benchmarks/source_counts.py 6387a59`` prints those of a revision beside those of this checkout. Lines are all
 lines of Python files; lines of docstrings and comments are among them.
+
+Assertions on sentences are the texts with more than two words of prose that tests compare with: operands in ``assert``,
+the argument ``match``, and facts of ``tests/facts.py``. Those of parametrised tests and of loops count once each.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ import argparse
 import ast
 import re
 import statistics
+from collections.abc import Iterator
 from pathlib import Path
 
 from landed import tree_of
@@ -24,6 +28,81 @@ PATTERNS = {
     "functions require_*": r"def _?require_",
     "locals named found, one, own, said, told": r"^\s+(found|one|own|said|told)(: [^=]+)? = ",
 }
+
+
+PROSE = re.compile(r"(?<![\w./'-])[A-Za-z][a-z]+(?![\w/_(=-]|\.\w)")
+"""Words: no names with digits, dots or underscores, no options, paths or calls."""
+LOOKING = {"startswith", "endswith", "count", "index", "find", "search", "match", "fullmatch", "findall", "escape"}
+LOOKING |= {"all", "any", "set", "sorted", "list", "tuple", "dict", "zip"}
+"""Calls whose texts are compared, too."""
+NAMING = {"refuses", "assert_names"}
+
+
+def _called(node: ast.Call) -> str:
+    return node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+
+
+def _compared(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield an expression and its parts, without the arguments of calls that compute something."""
+    yield node
+    if isinstance(node, ast.JoinedStr | ast.Constant):
+        return
+    if isinstance(node, ast.Call) and _called(node) not in LOOKING:
+        return
+    for child in [node.value] if isinstance(node, ast.Subscript) else ast.iter_child_nodes(node):  # a key is a name
+        yield from _compared(child)
+
+
+def _text(node: ast.AST) -> str:
+    parts = node.values if isinstance(node, ast.JoinedStr) else [node]
+    text = " 1 ".join(part.value for part in parts if isinstance(part, ast.Constant) and isinstance(part.value, str))
+    return "" if "\n" in text.strip() else text  # files and code have several lines
+
+
+def _named(function: ast.AST, names: set[str]) -> Iterator[ast.AST]:
+    """Yield the values that names have in a function: assigned, of a loop, or parametrised."""
+    for node in ast.walk(function):
+        if isinstance(node, ast.Assign):
+            target, values = node.targets[0], [node.value]
+        elif isinstance(node, ast.For | ast.comprehension) and isinstance(node.iter, ast.List | ast.Tuple):
+            target, values = node.target, node.iter.elts
+        elif isinstance(node, ast.Call) and _called(node) == "parametrize" and isinstance(node.args[1], ast.List):
+            target, values = node.args[0], node.args[1].elts
+        else:
+            continue
+        places = target.elts if isinstance(target, ast.Tuple | ast.List) else [target]
+        for i, place in enumerate(places):
+            if getattr(place, "id", getattr(place, "value", None)) in names:
+                whole = not isinstance(target, ast.Tuple | ast.List)
+                for value in values:
+                    row = getattr(value, "elts", getattr(value, "args", []))
+                    yield from [value] if whole else row[i : i + 1]
+
+
+def sentence_assertions(text: str) -> list[tuple[int, str]]:
+    """Return the lines of a test file, and the sentences in them, that its tests compare with."""
+    found: dict[tuple[int, int], str] = {}
+    for scope in ast.parse(text).body:
+        asserted = [node.test for node in ast.walk(scope) if isinstance(node, ast.Assert)]
+        for call in (node for node in ast.walk(scope) if isinstance(node, ast.Call)):
+            asserted += [word.value for word in call.keywords if word.arg == "match"]
+            asserted += call.args if _called(call) in NAMING else []
+        parts = [part for expression in asserted for part in _compared(expression)]
+        names = {part.id for part in parts if isinstance(part, ast.Name)}
+        parts += [part for value in _named(scope, names) for part in _compared(value)]
+        for part in parts:
+            if isinstance(part, ast.Constant | ast.JoinedStr) and len(PROSE.findall(_text(part))) > 2:
+                found[part.lineno, part.col_offset] = _text(part)
+    return [(line, said) for (line, _), said in sorted(found.items())]
+
+
+def counts_of_tests(tests: Path) -> dict[str, int]:
+    """Return the counts of a folder of tests."""
+    texts = [path.read_text() for path in sorted(tests.rglob("*.py"))]
+    return {
+        "lines of tests": sum(text.count("\n") for text in texts),
+        "assertions on sentences": sum(len(sentence_assertions(text)) for text in texts),
+    }
 
 
 def is_numeric(value: ast.expr) -> bool:
@@ -83,6 +162,8 @@ def main() -> None:
     print("|---" * (1 + len(columns)) + "|")
     for name in columns[0]:
         print(f"| {name} | {' | '.join(f'{column[name]:g}' for column in columns)} |")
+    for name, number in counts_of_tests(Path(__file__).resolve().parents[1] / "tests").items():
+        print(f"{name}, now: {number}")
 
 
 if __name__ == "__main__":

@@ -132,14 +132,13 @@ stated](tables/envelope-refused.csv).
 
 The present version is {version}; the table also has campaigns of versions 9 and 10, which differ little on smooth
 systems. Choices were made on development systems (cart-at-wall, gripper-on-floor, moored-boat, rail-cars,
-corner-stop), but results on reported systems led to some of them: four campaigns on smooth systems showed that an
-early interpolation lost much in five parameters; systems with contacts had no envelope until a missed test raised
-the factor (version 4), and until steps that touch something were left out of the data of draws (version 6); the
-losses on table-top and oblique-wall led to a better interpolation (version 9); missing tests on noisy systems led to
-executions that are kept for them (version 10). Since version 8, runs to places that no execution entered are not
-trusted: this costs up to a third of the share found, and without it 1.05 % of a puck's tasks were falsely trusted.
-Since version 11, the closed loops of each task that is asked about are run, which found 89, 81 and 95 % in place of
-67, 51 and 95 % on three development systems.
+corner-stop), but results on reported systems led to some of them: an early interpolation lost much in five
+parameters; systems with contacts had no envelope until a missed test raised the factor (version 4) and steps that
+touch something were left out of the data of draws (version 6); losses on table-top and oblique-wall led to a better
+interpolation (version 9), and missing tests on noisy systems to executions that are kept for them (version 10).
+Since version 8, runs to places that no execution entered are not trusted: this costs up to a third of the share
+found, and without it 1.05 % of a puck's tasks were falsely trusted. Since version 11, the closed loops of each task
+that is asked about are run, which found 89, 81 and 95 % in place of 67, 51 and 95 % on three development systems.
 """
 
 

@@ -53,7 +53,6 @@ def test_a_bound_that_is_withdrawn_for_gaps_is_not_to_be_weakened() -> None:
     known = Hyperparameters(2.5, np.array([-1.0]), float(np.log(EXACT)))
     doubt = diagnose([condition(known, X, y)], X).doubt
     assert doubt is not None
-    assert "more executions would come near to every task" in doubt
     assert not WEAKENS.search(doubt)
 
 

@@ -32,7 +32,7 @@ CONTROL = {
         "experiment",
     )
 }
-CONSTANTS = 205  # numbers in capitals that are no settings: tolerances of rounding, formats, layouts; never more
+CONSTANTS = 157  # numbers in capitals that are no settings: tolerances of rounding, formats, layouts; never more
 READ_ONLY = ("campaign.plot", "report")
 EXECUTING = {"execute", "run", "ask", "tell", "outcome", "distances", "plan"}
 

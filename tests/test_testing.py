@@ -14,6 +14,7 @@ from ctxval._util.arrays import Array
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.errors import ConformanceError
+from facts import refuses
 
 MODEL = models.Linear([[1.0, 0.1], [-0.2, 0.9]], [[0.0], [0.1]], [0.01, 0.0])
 TASKS = Task([np.linspace(-1, 1, 4), 0.0], goal=[0.5, 0.0], horizon=12, dt=0.1)
@@ -34,7 +35,7 @@ def test_sound_models_pass(model: models.Model) -> None:
 
 def test_a_model_that_mixes_up_its_batch_is_named() -> None:
     mixed = models.Function(lambda x, u: x - x.mean(axis=0), vectorized=True)
-    with pytest.raises(ConformanceError, match="step of a batch differs"):
+    with refuses(ConformanceError, 1.4, 1e-10):
         testing.check_model(mixed, states=2, inputs=1)
 
 
@@ -43,7 +44,7 @@ def test_a_wrong_jacobian_is_named() -> None:
         def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
             return self.A.T, self.B
 
-    with pytest.raises(ConformanceError, match="A of jacobian differs"):
+    with refuses(ConformanceError, 0.3, 2e-05):
         testing.check_model(Wrong(MODEL.A, MODEL.B), states=2, inputs=1)
 
 
@@ -64,9 +65,9 @@ def test_a_system_that_is_not_reset_or_ends_early_is_named() -> None:
             return done
 
     controller = LQR.design(TASKS[0], MODEL)
-    with pytest.raises(ConformanceError, match="away from the task's initial state"):
+    with refuses(ConformanceError, 0.388407):
         testing.check_system(Unreset(), controller, TASKS[0])
-    with pytest.raises(ConformanceError, match="states must have shape"):
+    with refuses(ConformanceError, "states", (12, 2)):
         testing.check_system(testing.FaultyRig(systems.Simulated(MODEL), {0: "short"}), controller, TASKS[0])
 
 
@@ -74,7 +75,7 @@ def test_noise_beyond_the_tolerance_is_named() -> None:
     rng = np.random.default_rng(0)
     noisy = systems.Simulated(lambda x, u: MODEL.step(x, u) + rng.normal(scale=1e-3, size=x.shape))
     controller = LQR.design(TASKS[0], MODEL)
-    with pytest.raises(ConformanceError, match="the first execution differs from the second"):
+    with refuses(ConformanceError, 0.006, 1e-10):
         testing.check_system(noisy, controller, TASKS[0])
     testing.check_system(noisy, controller, TASKS[0], tolerance=0.1)
 
@@ -90,7 +91,7 @@ def test_batches_that_are_exact_only_to_rounding_are_named() -> None:
 
     controller = LQR.design(TASKS[0], MODEL)
     testing.check_system(systems.Simulated(MODEL), controller, TASKS[0])
-    with pytest.raises(ConformanceError, match="an execution in a batch differs"):
+    with refuses(ConformanceError, 1e-13, 0):
         testing.check_system(Rounded(MODEL), controller, TASKS[0])
 
 
@@ -107,7 +108,7 @@ def test_sound_synthesizers_pass_and_one_that_mixes_tasks_is_named() -> None:
             mean = np.broadcast_to(task.initial_state.mean(axis=0), task.initial_state.shape)
             return LQR.design(Task(task.initial_state, goal=mean, horizon=task.horizon, dt=task.dt), model)
 
-    with pytest.raises(ConformanceError, match="closed loops of a batch"):
+    with refuses(ConformanceError, 0.45, 1e-08):
         testing.check_synthesizer(Mixed(), TASKS, MODEL)
 
 
@@ -130,13 +131,11 @@ def test_sound_controllers_with_memory_pass_and_others_are_named() -> None:
         return 0.1 * memory, memory
 
     testing.check_synthesizer(Remembering(lambda task: zeros, summed), TASKS, MODEL)
-    with pytest.raises(
-        ConformanceError, match=r"^step of a controller must return the pair \(u, memory\), got \[0\]\.$"
-    ):
+    with refuses(ConformanceError, "controller", [0]):
         testing.check_synthesizer(Remembering(lambda task: zeros, lambda t, x, memory: zeros), TASKS, MODEL)
-    with pytest.raises(ConformanceError, match=r"must be a function \(t, x\) -> u, or have the methods"):
+    with refuses(ConformanceError, "controller", "Controlled"):
         testing.check_synthesizer(Remembering(None, None), TASKS, MODEL)
-    with pytest.raises(ConformanceError, match="the controller must return"):
+    with refuses(ConformanceError, "controller", ()):
         testing.check_synthesizer(Remembering(lambda task: zeros, lambda t, x, memory: (1.0, memory)), TASKS, MODEL)
     calls: list[int] = []
 
@@ -144,7 +143,7 @@ def test_sound_controllers_with_memory_pass_and_others_are_named() -> None:
         calls.append(t)
         return -0.01 * len(calls) * x[..., :1], memory
 
-    with pytest.raises(ConformanceError, match="closed loop of a second run differs from that of the first"):
+    with refuses(ConformanceError, 0.046, 1e-10):
         testing.check_synthesizer(Remembering(lambda task: zeros, hidden), TASKS, MODEL)
 
 
@@ -167,9 +166,9 @@ def test_sound_distances_pass(distance: distances.Distance) -> None:
 
 
 def test_distances_that_are_negative_or_mix_tasks_are_named() -> None:
-    with pytest.raises(ConformanceError, match="finite and >= 0"):
+    with refuses(ConformanceError, 0, "distance"):
         testing.check_distance(lambda a, b, task: b.final_state[..., 0] - 10, *pair(), TASKS)
-    with pytest.raises(ConformanceError, match="has shape"):
+    with refuses(ConformanceError, (4,), ()):
         testing.check_distance(lambda a, b, task: np.float64(1.0), *pair(), TASKS)
 
 
@@ -187,7 +186,7 @@ def test_a_search_with_a_hidden_state_is_named() -> None:
             self.calls += 1
             return np.full(self.dimension, (self.calls * 0.3) % 1.0)
 
-    with pytest.raises(ConformanceError, match="same points"):
+    with refuses(ConformanceError, "values"):
         testing.check_search(Hidden())
 
 
@@ -196,7 +195,7 @@ def test_a_search_that_repeats_failed_points_is_named() -> None:
         def propose(self, rng: np.random.Generator) -> Array:
             return np.full(self.dimension, 0.5)
 
-    with pytest.raises(ConformanceError, match="failed point"):
+    with refuses(ConformanceError, "ask"):
         testing.check_search(Stubborn())
 
 
@@ -205,7 +204,7 @@ def test_the_rig_fails_where_it_is_told_to() -> None:
     rig = testing.FaultyRig(validation.system, {1: "raise"})
     plan = validation.plan([0.5])
     assert rig.execute(plan.controller, plan.task).finite
-    with pytest.raises(RuntimeError, match="motor cut out"):
+    with refuses(RuntimeError, "motor"):
         rig.execute(plan.controller, plan.task)
 
 
@@ -225,5 +224,5 @@ def test_convergence_is_told_by_booleans_that_are_the_same_in_a_batch() -> None:
     synthesizer = _Telling([1, 1], [1])
     for wrong in ("yes", np.array([1.0]), np.array([True, False])):
         synthesizer.told = wrong
-        with pytest.raises(ConformanceError, match="converged of a controller must be booleans"):
+        with refuses(ConformanceError, "controller"):
             testing.check_synthesizer(synthesizer, batch, model)

@@ -277,8 +277,7 @@ Most methods receive a distance from each execution. `vector` receives the vecto
 `auto` the trajectory; it may run M, and has the data that M was learned from, unless it says "without data". So
 `auto` shows the value of trajectories, and `scalar` the performance without them. VerifAI's cross-entropy and bandit
 learn only from counterexamples: they are told that tasks above d* / 2 are some, which is unknown in practice. TuRBO
-was written on BoTorch according to its paper. [Settings of each method](tables/benchmarks-settings.csv). VerifAI and
-PSY-TaLiRo need different versions of `attrs`, so there are two dependency groups, `peers` and `peers-verifai`.
+was written on BoTorch according to its paper. [Settings of each method](tables/benchmarks-settings.csv).
 
 ## Executions and computing time
 
@@ -296,9 +295,8 @@ Executions to 5 % of d*: medians over the seeds, with the number of seeds that r
   only distances often end in a local maximum.
 - {met} of {asked} targets of computing time are met ([targets](tables/benchmarks-targets.csv)).
 
-Other programs ran on the machine, so compare only orders of magnitude of times. The rows of `auto`, EGObox and
-bayesian-optimization are from a faster computer, on which `scalar` and GP-UCB took 0.62 to 0.75 of the time in the
-table.
+Other programs ran on the machine, so compare only orders of magnitude of times. `auto`, EGObox and
+bayesian-optimization ran on a faster computer (0.62 to 0.75 of the time of `scalar` and GP-UCB).
 
 ![CPU seconds of a suggestion](benchmarks/overhead.png)
 

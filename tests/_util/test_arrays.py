@@ -13,6 +13,7 @@ from ctxval._util.arrays import (
     single_threaded,
 )
 from ctxval.errors import InputError, ShapeError
+from facts import refuses
 
 
 def test_numbers_become_float64() -> None:
@@ -23,13 +24,13 @@ def test_numbers_become_float64() -> None:
 
 @pytest.mark.parametrize("value", ["goal", [1, [2, 3]], {"a": 1}, [object()]])
 def test_what_is_no_number_is_refused_by_name(value: object) -> None:
-    with pytest.raises(InputError, match=r"^x must be numbers, got "):
+    with refuses(InputError, "x"):
         as_floats("x", value)
 
 
 @pytest.mark.parametrize("value", [np.nan, [1.0, np.inf], None])
 def test_what_is_not_finite_is_refused_by_name_and_value(value: object) -> None:
-    with pytest.raises(InputError, match=r"^x must be finite, got .*(nan|inf)"):
+    with refuses(InputError, "x"):
         as_finite("x", value)
 
 
@@ -54,21 +55,21 @@ def test_a_weight_is_a_diagonal_or_a_matrix() -> None:
 
 @pytest.mark.parametrize("value", [1.0, [], [[1, 2]], np.zeros((2, 2, 2))])
 def test_a_weight_of_another_shape_is_refused(value: object) -> None:
-    with pytest.raises(ShapeError, match=r"Q must be a diagonal or a square matrix, not empty, got shape"):
+    with refuses(ShapeError, "Q"):
         as_weight("Q", value)
 
 
 @pytest.mark.parametrize(
-    ("value", "sentence"),
+    ("value", "facts"),
     [
-        ([1, np.nan], r"Q must be finite, got \[1.0, nan\]"),
-        ([[1, 2], [0, 1]], r"Q must be symmetric, got \[\[1.0, 2.0\], \[0.0, 1.0\]\]"),
-        ([1, -2], r"Q must have no negative eigenvalue, got \[\[1.0, 0.0\], \[0.0, -2.0\]\]"),
-        ([[1, 2], [2, 1]], r"Q must have no negative eigenvalue"),
+        ([1, np.nan], ("Q",)),
+        ([[1, 2], [0, 1]], ("Q", [1.0, 2.0], [0.0, 1.0])),
+        ([1, -2], ("Q", [1.0, 0.0], [0.0, -2.0])),
+        ([[1, 2], [2, 1]], ("Q", [[1.0, 2.0], [2.0, 1.0]])),
     ],
 )
-def test_a_weight_that_is_not_positive_semidefinite_is_refused(value: object, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
+def test_a_weight_that_is_not_positive_semidefinite_is_refused(value: object, facts: tuple[object, ...]) -> None:
+    with refuses(InputError, *facts):
         as_weight("Q", value)
 
 
@@ -103,7 +104,7 @@ HALF = np.ma.masked_array([1.0, 2.0], mask=[False, True])
 
 @pytest.mark.parametrize("value", [HALF, [HALF, HALF], ([1.0], [HALF]), np.ma.masked, [1.0, np.ma.masked]])
 def test_what_is_masked_is_refused_and_not_taken_from_below_the_mask(value: object) -> None:
-    with pytest.raises(InputError, match=r"^x must be numbers without masked entries; fill in"):
+    with refuses(InputError, "x"):
         as_floats("x", value)  # type: ignore[arg-type]
 
 
@@ -115,7 +116,7 @@ def test_a_masked_array_without_a_masked_number_is_an_array() -> None:
 def test_messages_about_large_arrays_stay_short() -> None:
     large = np.zeros((300, 300))
     large[7, 3] = np.nan
-    with pytest.raises(InputError, match=r"^x must be finite, got nan at \[7, 3\]\.$"):
+    with refuses(InputError, "x", [7, 3]):
         as_finite("x", large)
     with pytest.raises(InputError) as caught:
         as_floats("x", [["one"] * 10_000] * 100)
@@ -151,7 +152,7 @@ NO_NUMBERS = [
 
 @pytest.mark.parametrize("value", NO_NUMBERS, ids=repr)
 def test_what_numpy_would_convert_to_numbers_is_refused(value: object) -> None:
-    with pytest.raises(InputError, match="x must be numbers"):
+    with refuses(InputError, "x"):
         as_floats("x", value)  # type: ignore[arg-type]
 
 

@@ -30,6 +30,7 @@ from ctxval.core.distance import Distance
 from ctxval.core.system import Simulated, System
 from ctxval.distances import FinalState
 from ctxval.errors import CtxvalError, InputError, UnknownNameError
+from facts import refuses
 
 INFINITY, NAN = float("inf"), float("nan")
 WRONG: tuple[Any, ...] = (None, "text", NAN, -1, -0.5, 0, INFINITY, -INFINITY, [1.0, 2.0], [], 10**400, True)
@@ -158,22 +159,24 @@ class Inherited(Defined):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "facts"),
     [
-        ({"count": 0}, "count must be a positive integer, got 0"),
-        ({"count": True}, "count must be a positive integer, got True"),
-        ({"count": 2.0}, r"count must be a positive integer, got 2\.0"),
-        ({"rate": float("inf")}, "rate must be a positive number, got inf"),
-        ({"names": "ab"}, "names must be a list, got 'ab'"),
-        ({"names": ("a", 1)}, "names must be a list of which each item is a text"),
-        ({"pair": (1.0,)}, r"pair must be a list of 2 values, got \(1\.0,\)"),
-        ({"how": 3}, "how must be one of 'up', 'down', got 3"),
-        ({"table": [1]}, "table must be a table of names and values"),
-        ({"table": {"a": "b"}}, "table must be a table of which each value is a number"),
+        ({"count": 0}, ("count", 0)),
+        ({"count": True}, ("count", "True")),
+        ({"count": 2.0}, ("count", 2.0)),
+        ({"rate": float("inf")}, ("rate", "inf")),
+        ({"names": "ab"}, ("ab",)),
+        ({"names": ("a", 1)}, ("a", ("a", 1))),
+        ({"pair": (1.0,)}, ("pair", 2)),
+        ({"how": 3}, ("how", "up", "down")),
+        ({"table": [1]}, ("table", [1])),
+        ({"table": {"a": "b"}}, ("table", {"a": "b"})),
     ],
 )
-def test_a_refusal_names_the_argument_what_is_right_and_the_value(arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_a_refusal_names_the_argument_what_is_right_and_the_value(
+    arguments: dict[str, Any], facts: tuple[object, ...]
+) -> None:
+    with refuses(InputError, *facts):
         Inherited(**arguments)
 
 
@@ -184,12 +187,12 @@ def test_right_values_and_defaults_pass_as_they_are() -> None:
 
 
 def test_an_unknown_text_gets_the_nearest_known_one() -> None:
-    with pytest.raises(UnknownNameError, match="did you mean 'down'"):
+    with refuses(UnknownNameError, "down", "how"):
         Inherited(how="dwon")  # type: ignore[arg-type]
 
 
 def test_missing_arguments_are_pythons_own_errors_and_signatures_stay() -> None:
-    with pytest.raises(TypeError, match="unexpected keyword argument 'nonsense'"):
+    with refuses(TypeError, "nonsense", "Inherited.__init__"):
         Inherited(nonsense=1)  # type: ignore[call-arg]
     assert list(inspect.signature(Inherited).parameters) == ["count", "rate", "names", "pair", "how", "table"]
 
@@ -199,7 +202,7 @@ def test_an_annotation_that_cannot_be_resolved_checks_nothing() -> None:
         return count
 
     assert checked(function)(None, 2) == 2
-    with pytest.raises(InputError, match="count"):
+    with refuses(InputError, "count", 0):
         checked(function)(None, 0)
 
 
@@ -207,14 +210,14 @@ def test_a_value_can_be_required_by_itself() -> None:
     assert require("dt", Seconds, 0.1) == 0.1
     assert require("share", Annotated[float, Must("below 1", lambda value: value < 1)], 0.5) == 0.5
     for annotation, value in ((FiniteFloat, 10**400), (Probability, 1), (NonNegativeInt, -1), (float, float("nan"))):
-        with pytest.raises(InputError, match="value must be"):
+        with refuses(InputError, "value"):
             require("value", annotation, value)
 
 
 def test_a_class_is_no_object_of_it() -> None:
-    with pytest.raises(InputError, match="an object and no class, got"):
+    with refuses(InputError, "ctxval.core.system.Simulated"):
         require("system", System, Simulated)
-    with pytest.raises(InputError, match="an object and no class, got"):
+    with refuses(InputError, "model_trajectory", "system_trajectory"):
         require("distance", Distance, FinalState)
 
 
@@ -223,5 +226,5 @@ def test_an_object_that_has_the_part_is_refused_with_a_hint() -> None:
         def __init__(self) -> None:
             self.tau = 0.5
 
-    with pytest.raises(InputError, match=r"tau must be a positive number, got .*: give its \.tau\.$"):
+    with refuses(InputError, "tau"):
         require("tau", PositiveFloat, Case())

@@ -25,6 +25,7 @@ from ctxval._util.columns import (
 from ctxval._util.tables import CsvTable
 from ctxval.data import LogMapping, read_recordings
 from ctxval.errors import InputError
+from facts import assert_names, refuses
 
 
 def test_a_column_is_found_with_and_without_its_unit() -> None:
@@ -37,7 +38,7 @@ def test_a_column_is_found_with_and_without_its_unit() -> None:
     assert column_of("a", names, "v [mm/s]") == ("v", "mm/s")
     assert column_of("a", names, "angle [rad]") is None
     assert column_of("a", names, "w") is None
-    with pytest.raises(InputError, match="a has several columns for angle: angle_deg, angle_rad; name one"):
+    with refuses(InputError, "angle_deg", "angle_rad"):
         column_of("a", ("angle_deg", "angle_rad"), "angle")
 
 
@@ -63,7 +64,7 @@ def test_times_since_1970_are_recognised_by_their_size(unit: str, factor: float)
     np.testing.assert_array_equal(in_seconds("a", times, ""), times)
     assert f"t [{unit}]" in unit_advice(0.02 * factor, 0.02)
     assert unit_advice(0.02, 0.02 * 2.5) == unit_advice(0.1, 0.02) == ""
-    with pytest.raises(InputError, match="a: the unit of its times must be s, ms, us, ns, min or h, got 'deg'"):
+    with refuses(InputError, "times", "deg"):
         in_seconds("a", times, "deg")
 
 
@@ -120,21 +121,23 @@ def test_the_separator_is_found_in_the_header(separator: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("text", "sentence"),
+    ("text", "facts"),
     [
-        ("t,x0,u0,x0\n0,1,2,3\n1,1,,3\n", "a.csv has two columns 'x0': each name must be there once"),
-        ("t,x0 [m],u0,x0 [mm]\n0,1,2,3\n1,1,,3\n", "a.csv has two columns 'x0'"),
+        ("t,x0,u0,x0\n0,1,2,3\n1,1,,3\n", ("a.csv", "x0")),
+        ("t,x0 [m],u0,x0 [mm]\n0,1,2,3\n1,1,,3\n", ("a.csv", "x0")),
         (
             "t,x0,u0\n0,1,0,2,0\n0,1,1,0,\n",
-            "a.csv, line 2: the row must have 3 cells, as the header has, got 5. If com",
+            ("a.csv", 2, "row", 3),
         ),
-        ("t,x0,u0\n0,1,2\n1,1\n2,1,\n", "a.csv, line 3: the row must have 3 cells, as the header has, got 2"),
-        ("t;x0;u0\n0,0;1,5;2\n0.5;1,5;\n", "has decimal commas (line 2) and points (line 3) in numbers"),
-        ("t;x0;u0\n0;1.234,5;2\n1;1;\n", "a.csv, line 2: x0 must be a number, got '1.234,5'"),
-        ("t,x0,u0\n0,1_0,2\n1,1,\n", "a.csv, line 2: x0 must be a number, got '1_0'"),
+        ("t,x0,u0\n0,1,2\n1,1\n2,1,\n", ("a.csv", 3, "row", 2)),
+        ("t;x0;u0\n0,0;1,5;2\n0.5;1,5;\n", ()),
+        ("t;x0;u0\n0;1.234,5;2\n1;1;\n", ("a.csv", 2, "x0", "1.234,5")),
+        ("t,x0,u0\n0,1_0,2\n1,1,\n", ("a.csv", 2, "x0", "1_0")),
     ],
 )
-def test_a_table_that_could_be_misread_is_refused_by_all_readers(text: str, sentence: str, tmp_path: Path) -> None:
+def test_a_table_that_could_be_misread_is_refused_by_all_readers(
+    text: str, facts: tuple[object, ...], tmp_path: Path
+) -> None:
     (tmp_path / "a.csv").write_text(text)
     mapping = LogMapping.from_table({"states": ["x0"], "inputs": ["u0"]})
     for read in (
@@ -144,7 +147,7 @@ def test_a_table_that_could_be_misread_is_refused_by_all_readers(text: str, sent
     ):
         with pytest.raises(InputError) as caught:
             read(tmp_path / "a.csv")
-        assert sentence in str(caught.value)
+        assert_names(str(caught.value), *facts)
 
 
 def test_decimal_commas_are_read_between_semicolons(tmp_path: Path) -> None:
@@ -157,7 +160,7 @@ def test_decimal_commas_are_read_between_semicolons(tmp_path: Path) -> None:
 
 def test_a_file_with_several_recordings_is_no_trajectory(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t,x0,u0,episode\n0,1,2,0\n1,1,2,0\n2,5,2,1\n")
-    with pytest.raises(InputError, match=r"a\.csv has several recordings, which a column numbers"):
+    with refuses(InputError, "a.csv", "file"):
         Trajectory.from_csv(tmp_path / "a.csv")
 
 
@@ -191,7 +194,7 @@ def test_units_are_converted(recorded: str, wanted: str, factor: float) -> None:
     [("Hz", "rad/s"), ("deg", ""), ("deg", "1"), ("mg", "m/s^2"), ("m/s kg", "N"), ("ms", "m/s"), ("furlong", "m")],
 )
 def test_units_that_do_not_measure_the_same_are_refused(recorded: str, wanted: str) -> None:
-    with pytest.raises(InputError, match="no known factor"):
+    with refuses(InputError, recorded, wanted):
         conversion(recorded, wanted)
 
 

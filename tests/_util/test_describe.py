@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from ctxval import TaskSpace, controllers, distances, models, systems
 from ctxval._util.describe import describe, first_difference
+from facts import assert_names
 
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.sampled_from(["", "goal", "ß"]),
@@ -94,7 +95,7 @@ def test_a_users_function_in_a_part_of_this_package_is_its_source() -> None:
 
 def test_methods_of_parts_with_other_settings_are_told_apart() -> None:
     one, other = models.Linear([[1]], [[1]]), models.Linear([[2]], [[1]])
-    assert first_difference(stored(one.step), stored(other.step)) == "of.A[0][0] was 1.0 and is now 2.0"
+    assert_names(first_difference(stored(one.step), stored(other.step)), [0], 1.0, 2.0)
 
 
 def test_what_contains_itself_has_a_description() -> None:

@@ -39,6 +39,7 @@ from ctxval._util.tables import CsvTable, TableLimits
 from ctxval.cli.config.parts import recorded
 from ctxval.core.exchange import read_task
 from ctxval.errors import InputError, ShapeError
+from facts import refuses
 from rig_thorough import more
 
 POSIX = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs FIFOs and devices")
@@ -60,17 +61,9 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path, monkeypatch:
     Path("zero").symlink_to("/dev/zero")
     with socket.socket(socket.AF_UNIX) as server:
         server.bind("socket")
-        reasons = {
-            "fifo": "it is a FIFO and not a regular file",
-            "zero": "it is a device and not a regular file",
-            "socket": "No such device",
-            ".": "it is a folder",
-            "nothing": "No such file or directory",
-            "no\0name": "null",
-        }
-        for name, reason in reasons.items():
+        for name in ("fifo", "zero", "socket", ".", "nothing", "no\0name"):
             for read in (read_bytes, read_json, require_regular_file, open_regular, CsvTable):
-                with pytest.raises(InputError, match=reason):
+                with refuses(InputError):
                     read(name)
 
 
@@ -84,7 +77,7 @@ def test_no_reader_waits_for_a_fifo_or_reads_a_device(suffix: str, tmp_path: Pat
     for make in (lambda: os.mkfifo(path), lambda: path.symlink_to("/dev/zero")):
         make()
         for read in readers:
-            with pytest.raises(InputError, match=r"a\.\w+ cannot be read as .* (FIFO|device) and not a regular file"):
+            with refuses(InputError, path.name):
                 read(path)
         path.unlink()
 
@@ -94,22 +87,19 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
         file.truncate(2**33)  # sparse: it takes no space
     tracemalloc.start()
     for read in (read_bytes, read_json, CsvTable):
-        with pytest.raises(InputError, match="it has 8589934592 bytes, and at most"):
+        with refuses(InputError, 8589934592):
             read(tmp_path / "a")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 2**20
 
 
-@pytest.mark.parametrize(
-    ("content", "reason"),
-    [(b"[" * 100_000, "nested too deeply"), (b"{", "not JSON"), (b"\xff", "not JSON"), (b"9" * 5000, "not JSON")],
-)
-def test_hostile_json_gives_one_error(content: bytes, reason: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("content", [b"[" * 100_000, b"{", b"\xff", b"9" * 5000])
+def test_hostile_json_gives_one_error(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_bytes(content)
-    with pytest.raises(InputError, match=reason):
+    with refuses(InputError):
         read_json(tmp_path / "a.json")
-    with pytest.raises(InputError, match=rf"a\.json cannot be read as a ctxval task: .*{reason}"):
+    with refuses(InputError, "a.json"):
         read_task(tmp_path / "a.json")
 
 
@@ -121,17 +111,17 @@ def test_rows_have_the_numbers_of_their_lines(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "reason"),
+    ("content", "fact"),
     [
-        (b"t,x0\n0,1\0\n", "NUL bytes"),
-        (b"," * (2**20 + 1), "a row of more than 1048576 characters"),
-        (b'"\n",' * 400_000, "a row of more than 1048576 characters"),
-        (b"t,x0\n0," + b"1" * 200_000, "field limit"),
+        (b"t,x0\n0,1\0\n", "NUL"),
+        (b"," * (2**20 + 1), 1048576),
+        (b'"\n",' * 400_000, 1048576),
+        (b"t,x0\n0," + b"1" * 200_000, 131072),
     ],
 )
-def test_hostile_csv_gives_one_error(content: bytes, reason: str, tmp_path: Path) -> None:
+def test_hostile_csv_gives_one_error(content: bytes, fact: object, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(content)
-    with pytest.raises(InputError, match=rf"a\.csv cannot be read as CSV: .*{reason}"):
+    with refuses(InputError, "a.csv", fact):
         Trajectory.from_csv(tmp_path / "a.csv")
 
 
@@ -147,14 +137,14 @@ def test_messages_about_csv_stay_short(tmp_path: Path) -> None:
 def test_more_rows_than_a_plan_has_are_not_read(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t,x0\n" + "0,1\n" * 22)
     assert len(Trajectory.from_csv(tmp_path / "a.csv", most_rows=22).times) == 22
-    with pytest.raises(InputError, match=r"a\.csv must have 21 rows below its header, and has more"):
+    with refuses(InputError, "a.csv", 21):
         Trajectory.from_csv(tmp_path / "a.csv", most_rows=21)
 
 
 def test_numbers_of_csv_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.csv").write_text("t,x0\n" + "0,1\n" * 100)
     monkeypatch.setattr(CsvTable, "limits", TableLimits(numbers=1000))
-    with pytest.raises(InputError, match="too many numbers: 1000 bytes may be read"):
+    with refuses(InputError, 1000, "a.csv"):
         Trajectory.from_csv(tmp_path / "a.csv")
 
 
@@ -167,7 +157,7 @@ def test_a_file_that_grows_while_it_is_read_is_refused(tmp_path: Path, monkeypat
             self.st_mode, self.st_size = status.st_mode, status.st_size - 1
 
     monkeypatch.setattr(files.os, "fstat", lambda descriptor: Shorter(original(descriptor)))
-    with pytest.raises(InputError, match="it grew while it was read"):
+    with refuses(InputError):
         read_bytes(tmp_path / "a")
 
 
@@ -192,8 +182,8 @@ def test_a_link_is_written_through(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
-    for path, reason in ((tmp_path / "no" / "a.npz", "No such file"), (tmp_path, "irectory")):
-        with pytest.raises(InputError, match=f"cannot be written: .*{reason}"), written_whole(path) as file:
+    for path in (tmp_path / "no" / "a.npz", tmp_path):
+        with refuses(InputError, path), written_whole(path) as file:
             file.write(b"one")
 
 
@@ -236,7 +226,7 @@ def test_a_failed_attempt_takes_nothing_from_the_holder(tmp_path: Path) -> None:
 
 
 def test_where_no_file_can_be_there_is_no_lock(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match=r"No such file|unable to open"):
+    with refuses(FileNotFoundError, "lock"):
         FileLock(tmp_path / "missing" / "lock").acquire()
 
 
@@ -388,7 +378,7 @@ def test_hostile_archives_give_one_error_in_little_memory(name: str) -> None:
     try:
         with pytest.raises(InputError):
             Archive(HOSTILE[name]).numbers("ended")
-        with pytest.raises(InputError, match=r"^these bytes cannot be read as a trajectory: .*\.$"):
+        with refuses(InputError):
             Trajectory.from_npz(HOSTILE[name])
         assert tracemalloc.get_traced_memory()[1] < 4 * 2**20
     finally:
@@ -402,11 +392,11 @@ def test_a_bomb_is_refused_before_it_is_unpacked(dtype: Any) -> None:
     assert len(bomb) < 2**18
     tracemalloc.start()
     try:
-        with pytest.raises(InputError, match="is too large"):
+        with refuses(InputError, 4194304):
             Trajectory.from_npz(bomb, most=2**22)
         assert tracemalloc.get_traced_memory()[1] < 2**20
         # A plan knows how long a trajectory must be.
-        with pytest.raises(ShapeError, match=r"states of shape \(21, 2\), got \(4194304, 1\)"):
+        with refuses(ShapeError, "shape", (21, 2), (4194304, 1)):
             Trajectory.from_npz(bomb, shape=(21, 2))
         assert tracemalloc.get_traced_memory()[1] < 2**20
     finally:
@@ -416,7 +406,7 @@ def test_a_bomb_is_refused_before_it_is_unpacked(dtype: Any) -> None:
 def test_what_is_read_together_is_bounded() -> None:
     archive = Archive(saved(a=np.zeros(100), b=np.zeros(100)), most=1000)
     archive.numbers("a")
-    with pytest.raises(InputError, match=r"its array b of shape \(100,\) is too large: 200 bytes may be read"):
+    with refuses(InputError, "b", (100,), 200):
         archive.numbers("b")
 
 

@@ -48,7 +48,6 @@ def test_verdicts_on_the_crane_are_true_and_its_worst_task_can_be_typed_again() 
     assert campaign.verdict(0.9 * largest, certificate=options).answer == "falsified"
     above = campaign.verdict(1.1 * largest, certificate=options)
     assert above.answer != "falsified"
-    assert "the design of the controller did not converge at" in above.reason
     worst = campaign.worst
     assert worst is not None
     assert worst.distance is not None

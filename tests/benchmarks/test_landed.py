@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from facts import assert_names
+
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
@@ -21,7 +23,7 @@ RATIO = landed.Ratio("bench_auto", "a suggestion", [3.0, 1.0, 2.0], [0.5, 0.25, 
 def test_a_ratio_is_that_of_medians_and_has_a_spread() -> None:
     assert RATIO.value == 8.0
     assert RATIO.each == [6.0, 4.0, 8.0]
-    assert str(RATIO) == ("a suggestion: 2 and 0.25 CPU s, ratio 8.00, 4.0 to 8.0 in 3 repeats (asked: at least 8)")
+    assert_names(str(RATIO), 2, 0.25, "CPU", 8.0)
 
 
 @pytest.mark.parametrize(

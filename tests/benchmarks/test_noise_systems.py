@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from facts import assert_names
+
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 import calibrate_noise
@@ -60,5 +62,5 @@ def test_the_readme_has_the_numbers_of_the_stored_campaigns() -> None:
         return f"{answers.count('validated')} of {len(answers)}"
 
     page = " ".join((Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8").split())
-    assert f"{counts(0.95)} campaigns were validated 5 % below the true worst case" in page
-    assert f"{counts(1.25)} were validated 25 % above it" in page
+    assert_names(page, "validated", 5, counts(0.95))
+    assert_names(page, "validated", 25, counts(1.25))

@@ -27,6 +27,7 @@ from ctxval.errors import (
     UnknownNameError,
 )
 from ctxval.testing import FaultyRig
+from facts import refuses
 
 BY_DISTANCE = CertificateOptions(DistanceBound())
 
@@ -60,7 +61,7 @@ def test_gp_ucb_finds_the_worst_task(validation: Validation) -> None:
 
 def test_a_surrogate_needs_two_distances_and_then_interpolates(validation: Validation) -> None:
     campaign = Campaign(validation, search=searches.Random())
-    with pytest.raises(InputError, match="two known distances"):
+    with refuses(InputError, "surrogate", 1):
         campaign.run(1).surrogate()
     campaign.run(8)
     mean, deviation = campaign.surrogate().predict(np.array([t.unit_point for t in campaign.trials]))
@@ -148,21 +149,21 @@ def test_a_failure_is_told_with_what_was_recorded_before(validation: Validation)
     whole = validation.execute(opened.plan)
     states = whole.states.copy()
     states[8:] = np.nan
-    ended = campaign.tell(opened, Trajectory(whole.times, states, whole.inputs), failed="it was stopped")
-    assert (ended.state, ended.failure, ended.distance) == ("failed", "it was stopped", None)
+    ended = campaign.tell(opened, Trajectory(whole.times, states, whole.inputs), failed="stopped early")
+    assert (ended.state, ended.failure, ended.distance) == ("failed", "stopped early", None)
     recorded = campaign.store.trajectory(0, "system")
     assert np.array_equal(recorded.states, states[:8])
-    assert recorded.ended == "it was stopped"
+    assert recorded.ended == "stopped early"
     assert campaign.remeasure(distances.MaximumDeviation()) == []
     opened = campaign.ask()
-    for unusable, why in (
-        (Trajectory(whole.times, whole.states + 9.0, whole.inputs), "starts elsewhere"),
-        (Trajectory(0.1 * whole.times, whole.states, whole.inputs), "must have steps of 0.02 s"),
-        (Trajectory(whole.times, np.where(whole.times[:, None] > 0, np.nan, whole.states), whole.inputs), "not finite"),
-        (Trajectory(whole.times, whole.states[:, :1], whole.inputs), "2 states and 1 inputs, got 1 and 1"),
+    for unusable, facts in (
+        (Trajectory(whole.times, whole.states + 9.0, whole.inputs), ("start_tolerance",)),
+        (Trajectory(0.1 * whole.times, whole.states, whole.inputs), (0.02,)),
+        (Trajectory(whole.times, np.where(whole.times[:, None] > 0, np.nan, whole.states), whole.inputs), ()),
+        (Trajectory(whole.times, whole.states[:, :1], whole.inputs), (2, 1)),
     ):
-        with pytest.raises(InputError, match=f"failed execution has no step of this task: .*{why}"):
-            campaign.tell(opened, unusable, failed="it was stopped")
+        with refuses(InputError, "failed", *facts):
+            campaign.tell(opened, unusable, failed="stopped early")
 
 
 def test_tasks_of_failed_executions_are_executed_again_first(validation: Validation) -> None:
@@ -178,7 +179,7 @@ def test_tasks_of_failed_executions_are_executed_again_first(validation: Validat
     campaign = Campaign(validation.with_parts(system=fuse), search=searches.Random(), seed=1).run(6)
     failed = [trial.parameters for trial in campaign.failed]
     assert 0 < len(failed) < 6
-    with pytest.raises(InputError, match="again needs a reason"):
+    with refuses(InputError, "again"):
         campaign.run(8, again=" ")
     fuse.blown = False
     campaign.run(7 + len(failed), again="fuse replaced")
@@ -199,7 +200,7 @@ def test_what_fails_each_time_for_one_reason_costs_three_executions(validation: 
 
     campaign = Campaign(make_validation(system=Broken()))
     for executions in (3, 4):  # running again tries once more
-        with pytest.raises(CampaignError, match=f"all {executions} executions failed for one reason.*cannot open port"):
+        with refuses(CampaignError, "--execute", executions):
             campaign.run(20, 0.5)
         assert campaign.executions == executions
     some = gp_ucb(make_validation(system=FaultyRig(validation.system, dict.fromkeys((0, 1, 3, 4, 5), "raise"))))
@@ -210,7 +211,7 @@ def test_what_begins_to_fail_for_one_reason_costs_six_executions(validation: Val
     faults = dict.fromkeys([*range(2, 13), *range(14, 30)], "raise")
     campaign = gp_ucb(make_validation(system=FaultyRig(validation.system, faults)))
     for executions in (8, 20):  # running again tries as many more, counted from the last one that did not fail
-        with pytest.raises(CampaignError, match="the last 6 executions failed for one reason, so no more is executed"):
+        with refuses(CampaignError, 6, "--again-failed"):
             campaign.run(30)
         assert campaign.executions == executions
 
@@ -222,7 +223,7 @@ def test_a_run_that_breaks_off_each_time_for_one_reason_costs_six_executions(val
         return validation.model.step(x, u)
 
     campaign = gp_ucb(make_validation(system=systems.Simulated(step)))
-    with pytest.raises(CampaignError, match=r"last 6 executions failed for one reason.*the bus died.*--again-failed"):
+    with refuses(CampaignError, 6, "--again-failed"):
         campaign.run(30)
     assert campaign.executions == 6
     assert len(campaign.trajectories(campaign.trials[0])[1].states) > 1  # type: ignore[union-attr]
@@ -259,7 +260,7 @@ def test_a_replaced_failure_keeps_no_distance_of_the_one_before() -> None:
     states = whole.states + np.linspace(0, 9, len(whole.states))[:, None]
     stopped = Trajectory(whole.times, states, whole.inputs).first(8)
     assert campaign.tell(opened, stopped, failed="emergency stop").least > 1
-    replaced = campaign.tell(0, failed="it was never started", replace="the file of another run")
+    replaced = campaign.tell(0, failed="it was never started", replace="wrong file")
     assert replaced.least == 0
     assert campaign.verdict(1.0).answer == "undecided"
 
@@ -327,8 +328,8 @@ def test_running_leaves_trials_that_were_asked_by_hand_open(validation: Validati
     campaign.run(4, explore=True)
     assert campaign.trials[0].state == "open"
     assert campaign.executions == 4
-    campaign.tell(opened, failed="the battery was empty")
-    assert campaign.trials[0].failure == "the battery was empty"
+    campaign.tell(opened, failed="battery empty")
+    assert campaign.trials[0].failure == "battery empty"
 
 
 def test_a_manual_task_is_told_to_the_search_and_is_no_iid_draw(validation: Validation) -> None:
@@ -336,7 +337,7 @@ def test_a_manual_task_is_told_to_the_search_and_is_no_iid_draw(validation: Vali
     opened = campaign.ask({"goal": 1.25})
     assert opened.trial.origin == "manual"
     assert opened.trial.parameters == {"goal": pytest.approx(1.25)}
-    with pytest.raises(UnknownNameError, match="did you mean 'goal'"):
+    with refuses(UnknownNameError, "goal", "gaol"):
         campaign.ask({"gaol": 1.0})
 
 
@@ -345,19 +346,19 @@ def test_a_short_trajectory_told_by_hand_leaves_the_trial_open(validation: Valid
     opened = campaign.ask()
     whole = validation.execute(opened.plan)
     short = type(whole)(whole.times[:-1], whole.states[:-1], whole.inputs[:-1])
-    with pytest.raises(InputError, match=r"26 times, 25 steps of 0.02 s, got 25"):
+    with refuses(InputError, 26, 25, 0.02):
         campaign.tell(opened, short)
     assert campaign.tell(opened, whole).state == "completed"
 
 
 @pytest.mark.parametrize(
-    ("told", "sentence"),
-    [((99,), "there is no trial 99"), ((0,), "a trajectory, a distance or the reason")],
+    ("told", "facts"),
+    [((99,), (99, 1)), ((0,), ("failure",))],
 )
-def test_telling_nonsense_is_refused(validation: Validation, told: tuple[int, ...], sentence: str) -> None:
+def test_telling_nonsense_is_refused(validation: Validation, told: tuple[int, ...], facts: tuple[object, ...]) -> None:
     campaign = gp_ucb(validation)
     campaign.ask()
-    with pytest.raises(InputError, match=sentence):
+    with refuses(InputError, *facts):
         campaign.tell(*told)
 
 
@@ -377,7 +378,7 @@ def test_a_model_that_fails_stops_the_campaign_and_the_next_run_goes_on_behind_i
 
     model = Bad()
     campaign = gp_ucb(make_validation(model=model))
-    with pytest.raises(ModelError, match="model's closed loop got NaN from its controller at step 0"):
+    with refuses(ModelError, "NaN", 0):
         campaign.run(3)
     assert (campaign.executions, len(campaign.failed)) == (0, 1)
     model.fails = False
@@ -391,7 +392,7 @@ def test_a_distance_of_nan_stops_the_campaign_but_keeps_the_execution(validation
         return 0.0 if np.array_equal(model.states, system.states) else np.nan  # it works on M itself
 
     campaign = Campaign(make_validation(distance=broken))
-    with pytest.raises(DistanceError, match="one finite number"):
+    with refuses(DistanceError, "distance", "goal"):
         campaign.run(3)
     assert campaign.executions == 1
     assert campaign.trajectories(campaign.trials[0])[1] is not None
@@ -407,7 +408,7 @@ def test_verdicts_are_executed_facts_or_undecided(validation: Validation) -> Non
     assert falsified.witness is campaign.worst
     assert campaign.verdict(worst).answer == "undecided"
     for threshold in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(InputError, match="positive number"):
+        with refuses(InputError, "threshold"):
             campaign.verdict(threshold)
 
 
@@ -415,25 +416,25 @@ def test_verdicts_are_executed_facts_or_undecided(validation: Validation) -> Non
 def test_a_store_of_another_experiment_is_refused(validation: Validation, tmp_path: Path) -> None:
     Campaign(validation, store=tmp_path / "a.sqlite").run(2)
     longer = make_validation(horizon=26)
-    with pytest.raises(StoreMismatchError, match=r"trial 0 had 25 steps of .* and has now 26 steps"):
+    with refuses(StoreMismatchError, 0, 25, 26):
         Campaign(longer, store=tmp_path / "a.sqlite")
-    with pytest.raises(StoreMismatchError, match="seed was 0 and is now 1"):
+    with refuses(StoreMismatchError, "seed", 0, 1):
         Campaign(validation, store=tmp_path / "a.sqlite", seed=1)
     Campaign(validation, name="rig", store=tmp_path / "b.sqlite")
-    with pytest.raises(StoreMismatchError, match="give the campaign the name 'rig', or use another store"):
+    with refuses(StoreMismatchError, "rig", "store"):
         Campaign(validation, store=tmp_path / "b.sqlite")
     assert Campaign(validation, store=tmp_path / "a.sqlite").executions == 2
 
 
 @pytest.mark.parametrize("budget", [0, -3, 2.5, True, None])
 def test_a_budget_is_a_positive_integer(validation: Validation, budget: object) -> None:
-    with pytest.raises(InputError, match="positive integer"):
+    with refuses(InputError, "budget"):
         Campaign(validation).run(budget)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("arguments", [{"seed": -1}, {"seed": 1.5}, {"search": object()}])
 def test_bad_arguments_are_named(validation: Validation, arguments: dict[str, object]) -> None:
-    with pytest.raises(InputError, match=next(iter(arguments))):
+    with refuses(InputError, *arguments):
         Campaign(validation, **arguments)  # type: ignore[arg-type]
 
 
@@ -442,7 +443,7 @@ def test_a_search_that_leaves_the_cube_is_told_so(validation: Validation) -> Non
         def propose(self, rng: np.random.Generator) -> np.ndarray:
             return np.array([1.5])
 
-    with pytest.raises(InputError, match="unit cube"):
+    with refuses(InputError, "search"):
         Campaign(validation, search=Outside()).run(1)
 
 
@@ -481,7 +482,7 @@ def test_an_audit_adds_independent_draws_until_there_are_so_many(validation: Val
 def test_an_audit_refuses_trials_that_people_are_executing(validation: Validation, tmp_path: Path) -> None:
     campaign, other = (Campaign(validation, store=tmp_path / "a.sqlite") for _ in range(2))
     opened = [other.ask(), other.ask()]
-    with pytest.raises(CertificateError, match=r"trials are open: 0, 1\. Record their results with `ctxval tell`"):
+    with refuses(CertificateError, 0, 1):
         campaign.audit(2)
     assert len(campaign.trials) == 2
     for trial in opened:
@@ -564,7 +565,7 @@ def test_a_failed_draw_of_an_audit_counts_as_one(validation: Validation) -> None
 
 @pytest.mark.parametrize("draws", [0, -3, 2.5, True, None])
 def test_the_draws_of_an_audit_are_a_positive_integer(validation: Validation, draws: object) -> None:
-    with pytest.raises(InputError, match="draws must be a positive integer"):
+    with refuses(InputError, "draws"):
         Campaign(validation).audit(draws)  # type: ignore[arg-type]
 
 
@@ -688,7 +689,7 @@ def test_a_failure_with_undecodable_text_is_stored(validation: Validation) -> No
 
 def test_two_processes_do_not_run_one_store(validation: Validation, tmp_path: Path) -> None:
     first, second = (Campaign(validation, store=tmp_path / "a.sqlite") for _ in range(2))
-    with first.store.sole_writer(), pytest.raises(StoreAccessError, match="run by another process"):
+    with first.store.sole_writer(), refuses(StoreAccessError, "a.sqlite"):
         second.run(1)
     assert second.run(1).executions == 1
 
@@ -697,7 +698,7 @@ def test_an_open_trial_of_another_campaign_is_refused(validation: Validation) ->
     here, there = gp_ucb(validation, seed=1), gp_ucb(validation, seed=2)
     here.ask()
     opened = there.ask()
-    with pytest.raises(InputError, match="another campaign"):
+    with refuses(InputError, 0):
         here.tell(opened, validation.execute(opened.plan))
 
 
@@ -728,9 +729,9 @@ def test_options_beside_a_certificate_are_refused() -> None:
     campaign = Campaign(make_validation(), seed=1).run(3, explore=True)
     by = CertificateOptions(confidence=0.9)
     for options in ({"confidence": 0.99}, {"resolution": 0.5}):
-        with pytest.raises(InputError, match="options of certificate=; state them there"):
+        with refuses(InputError, "certificate"):
             campaign.verdict(9.0, certificate=by, **options)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="certificate must be a CertificateOptions, got 'audit'"):
+    with refuses(InputError, "certificate", "CertificateOptions", "audit"):
         campaign.verdict(9.0, certificate="audit")  # type: ignore[arg-type]
 
 
@@ -755,13 +756,13 @@ class Odd(searches.BaseSearch):
 
 @pytest.mark.parametrize("points", [[[1.0], [2.0, 3.0]], "left", [[1j]], [["a"]], None, [[1.5]]])
 def test_points_of_an_own_search_that_are_none_are_named(points: object) -> None:
-    with pytest.raises(InputError, match="a search must return points of the unit cube"):
+    with refuses(InputError, "search", "points"):
         Campaign(make_validation(), search=Odd(points)).run(1)
 
 
 @pytest.mark.parametrize("note", [[1], {"a": np.array([1])}, {"b": np.bool_(True)}, {"c": float("nan")}, "text"])
 def test_a_note_that_cannot_be_stored_is_named(note: object) -> None:
     campaign = Campaign(make_validation(), search=Odd([[0.5]], note))
-    with pytest.raises(InputError, match="the note of a search must be a dictionary of plain values"):
+    with refuses(InputError, "search", "note"):
         campaign.run(1)
     assert not campaign.trials

@@ -15,6 +15,7 @@ import pytest
 from conftest import make_validation
 from ctxval import Campaign, Store, Trial, searches
 from ctxval.errors import CampaignError, InputError, StoreAccessError
+from facts import assert_names, refuses
 from rig_thorough import more
 from test_how_to import DOCS, blocks
 
@@ -152,7 +153,7 @@ def test_a_job_beyond_the_time_limit_is_cancelled_even_if_that_fails() -> None:
     queue = Queue(float("inf"))
     campaign = Campaign(make_validation()).run(1, executor=queue, timeout=1e-9)
     assert queue.jobs[0].cancelled
-    assert campaign.trials[0].failure == "the execution did not end within 1e-09 s"
+    assert_names(campaign.trials[0].failure, 1e-09)
 
 
 def test_what_cannot_be_executed_there_is_named_by_the_last_error_of_its_traceback() -> None:
@@ -163,7 +164,7 @@ def test_what_cannot_be_executed_there_is_named_by_the_last_error_of_its_traceba
 
             return super().submit(fail)
 
-    with pytest.raises(InputError, match="cannot be sent to a worker: ModuleNotFoundError: No module 'rig'"):
+    with refuses(InputError, "ModuleNotFoundError", "rig"):
         Campaign(make_validation()).run(1, executor=Elsewhere(0))
 
 
@@ -223,7 +224,7 @@ def test_trials_are_stored_before_they_wait(tmp_path: Path) -> None:
 
 def test_what_waited_when_the_executor_ended_is_executed_later(tmp_path: Path) -> None:
     path = tmp_path / "a.sqlite"
-    with pytest.raises(CampaignError, match="the executor takes no more work: RuntimeError: the queue is closed"):
+    with refuses(CampaignError, "executor", "RuntimeError"):
         random_campaign(path).run(20, executor=Queue(2, most=9), workers=2)
     before = Store(path).trials()
     assert any(trial.state == "open" and trial.attempts for trial in before)

@@ -29,6 +29,7 @@ from ctxval.campaign.storage.recovery import recover
 from ctxval.campaign.storage.rows import Side
 from ctxval.cli import app
 from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAccessError, StoreError
+from facts import assert_names, refuses, warns
 from rig_cli import SMALL
 from rig_thorough import more
 
@@ -41,7 +42,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store with trials of every kind."""
     path = tmp_path_factory.mktemp("store") / "whole.sqlite"
     campaign = Campaign(make_validation(), search=SEARCH(), store=path, seed=2).run(12)
-    campaign.tell(campaign.ask(), failed="the motor cut out")
+    campaign.tell(campaign.ask(), failed="motor stalled")
     campaign.ask()
     campaign.add({"goal": 1.0}, distance=0.5)
     campaign.store.close()
@@ -72,7 +73,7 @@ def test_a_whole_store_is_exported_whole(whole: Path, tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     trials = Store(whole).trials()
     assert [float(row["distance"]) for row in rows[:12]] == [trial.distance for trial in trials[:12]]
-    assert (rows[12]["failure"], rows[14]["origin"], rows[14]["goal"]) == ("the motor cut out", "manual", "1.0")
+    assert (rows[12]["failure"], rows[14]["origin"], rows[14]["goal"]) == ("motor stalled", "manual", "1.0")
     content = json.loads((tmp_path / "out" / "trials.json").read_text())
     assert content["experiment"]["seed"] == 2
     kept = Trajectory.from_csv(tmp_path / "out" / "trajectories" / "3.system.csv")
@@ -98,8 +99,6 @@ def test_a_cut_store_is_a_clear_error_and_what_is_readable_is_exported(
     if not found.trials and not found.trajectories:
         assert share < 0.1
         assert status == 2
-        assert "nothing can be read" in json.loads(stdout)["error"]
-        assert "nothing can be read" in stderr
         return
     assert status == 0, stderr
     report = json.loads(stdout)
@@ -122,7 +121,7 @@ def test_rows_that_cannot_be_read_are_told_together(whole: Path, tmp_path: Path)
     found = recover(broken)
     assert len(found.trials) == 15
     assert len(found.damaged) < 5
-    assert any(" rows from 0 to " in sentence for sentence in found.damaged)
+    assert_names(found.damaged, 0)
 
 
 Everything = tuple[list[tuple[object, ...]], list[tuple[bytes, bytes, bytes] | None]]
@@ -181,10 +180,10 @@ def test_an_edited_distance_is_noticed(whole: Path, tmp_path: Path) -> None:
     shutil.copy(whole, path)
     store = Store(path)
     store._execute("UPDATE trials SET distance = distance * 1.5 WHERE number = 3")
-    with pytest.raises(ForeignStoreError, match="is damaged: its trial 3 cannot be read"):
+    with refuses(ForeignStoreError, 3, "edited.sqlite"):
         store.trials()
     assert 3 not in recover(path).trials
-    assert "trial 3: its checksum does not fit" in recover(path).damaged
+    assert_names(recover(path).damaged, 3)
 
 
 def test_a_missing_trial_is_noticed(whole: Path, tmp_path: Path) -> None:
@@ -192,7 +191,7 @@ def test_a_missing_trial_is_noticed(whole: Path, tmp_path: Path) -> None:
     shutil.copy(whole, path)
     store = Store(path)
     store._execute("DELETE FROM trials WHERE number = 3")
-    with pytest.raises(ForeignStoreError, match="its trial 3 is missing"):
+    with refuses(ForeignStoreError, 3, "short.sqlite"):
         store.trials()
 
 
@@ -295,7 +294,7 @@ def test_a_network_file_system_is_warned_of(tmp_path: Path, monkeypatch: pytest.
     assert file_system(Path("/home/x/a.sqlite"), mounts) == "ext4"
     assert file_system(Path("/a.sqlite"), "") == ""
     monkeypatch.setattr("ctxval.campaign.storage.disks.file_system", lambda path, mounts: "nfs4")
-    with pytest.warns(StoreWarning, match=r"is on a network file system \(nfs4\)"):
+    with warns(StoreWarning, "nfs4", "a.sqlite"):
         Store(tmp_path / "a.sqlite")
 
 
@@ -349,7 +348,7 @@ class Acts(RuleBasedStateMachine):
     def tell(self, who: int, number: int, distance: float, cut: bool) -> None:
         campaign = self.terminals[who]
         if number >= len(self.expected) or self.expected[number][0] != "open":
-            with pytest.raises(InputError, match=r"there is no trial|so nothing more can be told"):
+            with refuses(InputError, number):
                 campaign.tell(number, distance=distance)
         elif cut:
             self.cut_off(who, lambda: campaign.tell(number, distance=distance))
@@ -446,7 +445,7 @@ def test_no_cells_make_the_reader_of_csv_stumble(rows: list[list[str]]) -> None:
 def test_lines_are_counted_with_the_blank_ones(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     path.write_text('t,x0,u0\n\n0,1,2\n\n\n1,"a\nb",2\n')
-    with pytest.raises(InputError, match="line 7: x0 must be a number, got 'a"):
+    with refuses(InputError, 7, "x0"):
         Trajectory.from_csv(path)
 
 

@@ -21,6 +21,7 @@ from ctxval.cli.config.settings import read_settings
 from ctxval.errors import DistanceError, InputError, StoreError, StoreMismatchError
 from ctxval.gp.kernels import Matern
 from ctxval.testing import FaultyRig
+from facts import assert_names, refuses
 from rig_thorough import more
 
 SEARCH = searches.GPUCB
@@ -89,7 +90,7 @@ def test_a_model_learned_again_is_noticed_even_if_its_weights_are_private(tmp_pa
     assert campaign(tmp_path / "a.sqlite", make_validation(model=Private(learned))).executions == 4
     other = make_validation(model=Private(learned, gain=1.01))
     for reason in (None, "learned from more data"):
-        with pytest.raises(StoreMismatchError, match=r"for the task of trial \d differs .* use another store"):
+        with refuses(StoreMismatchError, "a.sqlite", 0):
             campaign(tmp_path / "a.sqlite", other, accept_change=reason)
 
 
@@ -131,7 +132,7 @@ def test_another_distance_is_refused_until_everything_is_measured_anew(tmp_path:
     path = tmp_path / "a.sqlite"
     before = campaign(path, make_validation(distance=Scaled())).run(6)
     for reason in (None, "it is the same"):
-        with pytest.raises(StoreMismatchError, match=r"was .* and is now .*ctxval remeasure STORE"):
+        with refuses(StoreMismatchError, "STORE", "remeasure"):
             campaign(path, make_validation(distance=other), accept_change=reason)
     after = campaign(path, make_validation(distance=other), remeasure=True)
     np.testing.assert_allclose([t.distance for t in after.trials], [2 * (t.distance or 0) for t in before.trials])
@@ -148,7 +149,7 @@ def test_another_distance_is_refused_until_everything_is_measured_anew(tmp_path:
 
 def test_a_distance_that_is_only_written_otherwise_can_be_accepted(store: Path) -> None:
     same = make_validation(distance=lambda model, system, task: distances.FinalState(norm=1)(model, system, task))
-    with pytest.raises(StoreMismatchError, match="remeasure"):
+    with refuses(StoreMismatchError, "remeasure", "a.sqlite"):
         campaign(store, same)
     accepted = campaign(store, same, accept_change="rewritten")
     assert [(c.what, c.why) for c in accepted.store.history()] == [("accepted", "rewritten")]
@@ -172,9 +173,9 @@ def test_a_distance_that_raises_now_changes_nothing(store: Path) -> None:
         raise ZeroDivisionError("no")
 
     before = Store(store).trials()
-    with pytest.raises(DistanceError, match="the distance of trial 0 cannot be computed again, and nothing is changed"):
+    with refuses(DistanceError, "distance", 0):
         campaign(store, make_validation(distance=broken), remeasure=True)
-    with pytest.raises(DistanceError, match="nothing is changed"):
+    with refuses(DistanceError, 0):
         campaign(store).remeasure(broken)
     assert [t.distance for t in Store(store).trials()] == [t.distance for t in before]
     assert campaign(store).executions == 7
@@ -185,7 +186,7 @@ def test_a_distance_that_was_told_alone_is_none_of_another_definition(store: Pat
     told.tell(told.ask(), distance=0.25)
     after = campaign(store, make_validation(distance=Scaled(scale=2.0)), remeasure=True)
     assert (after.trials[7].state, after.trials[7].distance, after.executions) == ("unmeasured", None, 8)
-    assert "told without a trajectory" in str(after.trials[7].failure)
+    assert_names(str(after.trials[7].failure), "told")
     assert after.store.history()[0].content["before"]["7"]["distance"] == 0.25
 
 
@@ -194,9 +195,9 @@ def test_a_distance_that_was_told_alone_is_none_of_another_definition(store: Pat
 
 def test_a_repaired_system_goes_on_with_a_note(store: Path) -> None:
     repaired = make_validation(system=FaultyRig(make_validation().system))
-    with pytest.raises(StoreMismatchError, match=r"validation\.system.*--accept-change"):
+    with refuses(StoreMismatchError, "--accept-change", "a.sqlite"):
         campaign(store, repaired)
-    with pytest.raises(InputError, match="needs a reason"):
+    with refuses(InputError, "change"):
         campaign(store, repaired, accept_change=" ")
     accepted = campaign(store, repaired, accept_change="gripper replaced")
     (change,) = accepted.store.history()
@@ -210,14 +211,14 @@ def test_another_question_cannot_be_accepted(store: Path) -> None:
         {"search": searches.Random()},
         {"name": "other"},
     ):
-        with pytest.raises(StoreMismatchError, match="use another store"):
+        with refuses(StoreMismatchError, "store", "a.sqlite"):
             Campaign(make_validation(), **{"search": SEARCH(), "seed": 2, **change}, store=store, accept_change="x")
 
 
 def test_the_unit_of_a_parameter_is_part_of_the_question(store: Path) -> None:
     other = make_validation()
     other.space = TaskSpace(goal=(-3.0, 3.0, "deg"))
-    with pytest.raises(StoreMismatchError, match=r"space\.goal\[2\] was 'rad' and is now 'deg'"):
+    with refuses(StoreMismatchError, "rad", "deg"):
         campaign(store, other, accept_change="x")
 
 
@@ -229,21 +230,21 @@ def test_the_unit_of_a_parameter_is_part_of_the_question(store: Path) -> None:
 def test_other_tasks_need_another_store_whatever_the_reason(store: Path, space: TaskSpace) -> None:
     other = make_validation()
     other.space = space
-    with pytest.raises(StoreMismatchError, match=r"validation\.space.*use another store"):
+    with refuses(StoreMismatchError, "a.sqlite", "validation.space.goal"):
         campaign(store, other, accept_change="only these tasks matter")
 
 
 def test_a_failure_cannot_be_dropped(store: Path) -> None:
     made = campaign(store)
     failed = made.tell(made.ask(), failed="it slipped")
-    with pytest.raises(InputError, match=f"trial {failed.number} is failed"):
+    with refuses(InputError, "failed", 7, failed.number):
         made.tell(failed.number, distance=0.1)
     by = CertificateOptions(DistanceBound(resolution=1.0))
     assert made.verdict(1e3, certificate=by).answer == "undecided"
     made.tell(made.ask(failed.parameters), distance=0.1)  # it succeeds for no stated reason
     verdict = made.verdict(1e3, certificate=by)
     assert verdict.answer == "undecided"
-    assert f"trial {failed.number} failed and trial {failed.number + 1} executed the same task" in verdict.reason
+    assert_names(verdict.reason, "failed", failed.number, failed.number + 1)
 
 
 # Without a search
@@ -284,7 +285,7 @@ class Random(searches.Random):
 )
 def test_a_search_that_cannot_be_made_again_must_be_given(tmp_path: Path, search: Any, called: str) -> None:
     Campaign(make_validation(), search=search, seed=2, store=tmp_path / "a.sqlite")
-    with pytest.raises(StoreMismatchError, match=rf"a\.sqlite was made with the search '{called}'.*search= in Python"):
+    with refuses(StoreMismatchError, "a.sqlite", "search", called):
         Campaign(make_validation(), seed=2, store=tmp_path / "a.sqlite")
     assert Campaign(make_validation(), search=search, seed=2, store=tmp_path / "a.sqlite").search is search
 
@@ -372,7 +373,7 @@ def test_a_campaign_that_has_not_seen_another_distance_writes_nothing(tmp_path: 
         lambda: stale.add({"goal": 1.0}, stale.validation.execute(stale.validation.plan([1.0]))),
         lambda: stale.ask(),
     ):
-        with pytest.raises(StoreMismatchError, match="made by another experiment"):
+        with refuses(StoreMismatchError, "a.sqlite", "validation.distance.type"):
             act()
     assert [t.state for t in Store(path).trials()] == ["completed", "completed", "open"]
     assert fresh.run(5).executions == 5
@@ -387,7 +388,7 @@ def test_what_is_measured_by_the_old_distance_at_the_same_time_is_kept_beside(tm
     campaign(path, make_validation(distance=Scaled(scale=100.0)), remeasure=True)
     stale.store.signature = lambda: before  # type: ignore[method-assign]  # it has looked just before
     stale.store._require_unchanged = Store(path)._require_unchanged  # type: ignore[method-assign]
-    with pytest.raises(StoreMismatchError, match=r"changed since the campaign was opened.*kept in .*a\.trial-0\.npz"):
+    with refuses(StoreMismatchError, "a.trial", "0.npz"):
         stale.tell(opened, whole)
 
 
@@ -448,7 +449,7 @@ def test_a_task_that_was_told_in_another_distance_counts_again_once_it_is_execut
     told, by = campaign(store), CertificateOptions(DistanceBound(resolution=1.0))
     told.tell(told.ask({"goal": 1.0}), distance=0.25)
     told.remeasure(Scaled(scale=2.0))
-    assert "Trial 7 was executed, but the distance could not be measured" in told.verdict(1e6, certificate=by).reason
+    assert_names(told.verdict(1e6, certificate=by).reason, 7, "distance")
     again = told.ask({"goal": 1.0})
     told.tell(again, told.validation.execute(again.plan))
     assert "could not be measured" not in told.verdict(1e6, certificate=by).reason

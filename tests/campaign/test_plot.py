@@ -23,6 +23,7 @@ from ctxval import (
     testing,
 )
 from ctxval.errors import InputError
+from facts import refuses
 from rig_thorough import more
 
 
@@ -68,11 +69,11 @@ def test_pictures_are_written(campaign: Campaign, tmp_path: Path, ending: str) -
 
 
 def test_a_picture_that_cannot_be_written_or_drawn_is_an_input_error(campaign: Campaign, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be written"):
+    with refuses(InputError, "a.png"):
         plot.save(plot.worst_trajectories(campaign), tmp_path / "none" / "a.png")
-    with pytest.raises(InputError, match="cannot be written"):
+    with refuses(InputError, "a.nonsense"):
         plot.save(plot.worst_trajectories(campaign), tmp_path / "a.nonsense")
-    with pytest.raises(InputError, match="nothing to draw"):
+    with refuses(InputError):
         plot.worst_trajectories(Campaign(make_validation()))
 
 
@@ -96,7 +97,7 @@ def test_one_slice_of_the_surrogate_is_drawn_into_given_axes(campaign: Campaign,
     assert plot.surrogate_slice(campaign, ax=ax) is ax
     assert ax.get_xlabel() == "goal [rad]"
     assert ax.get_ylabel() == "distance [rad]"
-    with pytest.raises(InputError, match="axis must be from 0 to 0, one of goal, got 1"):
+    with refuses(InputError, "axis", 0, 1):
         plot.surrogate_slice(campaign, 1, ax=ax)
 
 
@@ -120,7 +121,7 @@ def test_a_campaign_draws_its_surrogate_or_its_convergence(campaign: Campaign, a
     other = Figure().add_subplot()
     assert Campaign(make_plane(), seed=1).run(2).plot(ax=other) is other
     assert other.get_xlabel() == "trial"
-    with pytest.raises(InputError, match="nothing to draw"):
+    with refuses(InputError):
         Campaign(make_validation()).plot(ax=ax)
 
 

@@ -17,6 +17,7 @@ from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.cli import app
 from ctxval.errors import ForeignStoreError
 from ctxval.report.context import context_of_campaign
+from facts import assert_names, refuses
 from rig_thorough import more
 
 BY = CertificateOptions(DistanceBound(resolution=1.0))
@@ -46,16 +47,13 @@ def test_a_threshold_chosen_after_looking_is_said_once_and_for_all(tmp_path: Pat
     made = campaign(store).run(6)
     verdict = judged(made, 50.0)
     assert verdict.answer == "validated"
-    assert verdict.reason.endswith("; the threshold was stated after 6 distances were known.")
+    assert_names(verdict.reason, "stated", 6)
     assert verdict.rests_on is not None
-    assert (
-        "; on the threshold not being chosen to suit the 6 distances that were known when it was stated; on this "
-        "campaign not being chosen among several." in verdict.rests_on
-    )
+    assert_names(verdict.rests_on, 6, "stated", "campaign")
     stated = made.store.thresholds()
     again = made if store is None else campaign(store)
     again.run(7, 50.0, explore=True)
-    assert "after 6 distances were known" in judged(again, 50.0).reason
+    assert_names(judged(again, 50.0).reason, 6)
     assert again.store.thresholds() == stated
 
 
@@ -65,8 +63,8 @@ def test_smaller_thresholds_that_failed_before_are_named() -> None:
     assert judged(made, 0.5 * worst).answer == "falsified"
     assert judged(made, worst * (1 + 1e-9)).answer == "undecided"
     reason = judged(made, 50.0).reason
-    assert f"; the smaller threshold {0.5 * worst:.6g}, which was stated before, is falsified; " in reason
-    assert f"; the smaller threshold {worst:.6g}, which was stated before, is left undecided." in reason
+    assert_names(reason, "smaller", "falsified", f"{0.5 * worst:.6g}")
+    assert_names(reason, "smaller", "undecided", f"{worst:.6g}")
     assert " 50" not in judged(made, 40.0).reason.split("the threshold was stated")[1]  # it is larger
     # A threshold that was stated before any other has nothing before it.
     first = campaign()
@@ -105,7 +103,7 @@ def test_thresholds_that_no_campaign_wrote_are_refused(tmp_path: Path, value: st
     campaign(path).store.close()
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("UPDATE experiment SET value = ? WHERE key = 'thresholds'", (value,))
-    with pytest.raises(ForeignStoreError, match="its thresholds cannot be read"):
+    with refuses(ForeignStoreError, "a.sqlite"):
         Store(path).thresholds()
 
 
@@ -122,7 +120,7 @@ def test_another_definition_of_the_distance_has_thresholds_of_its_own(tmp_path: 
     distance = made.validation.distance
     made.remeasure(lambda model, system, task: 2.0 * distance(model, system, task))
     assert made.store.thresholds() == ()
-    assert "after 6 distances were known" in judged(made, 50.0).reason
+    assert_names(judged(made, 50.0).reason, 6)
 
 
 def invoke(*arguments: str) -> Any:
@@ -134,14 +132,14 @@ def test_what_only_reads_records_no_threshold_and_says_what_holds(tmp_path: Path
     made = campaign(path).run(6)
     before = path.read_bytes()
     context = context_of_campaign(made, threshold=50.0, certificate=BY)
-    assert "after 6 distances were known" in str(context.verdict)
+    assert_names(str(context.verdict), 6)
     certified = invoke("certify", str(path), "--threshold", "50", "--kind", "posterior", "--resolution", "1")
-    assert "the threshold was stated after 6 distances were known" in " ".join(certified.stdout.split())
+    assert_names(" ".join(certified.stdout.split()), "threshold", 6)
     assert invoke("report", str(path), "--threshold", "50").exit_code == 0
     assert invoke("status", str(path)).exit_code == 0
     assert path.read_bytes() == before
     made.state_threshold(50.0)
-    assert "threshold 50: stated after 6 known distances" in invoke("status", str(path)).stdout
+    assert_names(invoke("status", str(path)).stdout, "threshold", 50, 6)
 
 
 def test_the_campaigns_of_one_experiment_are_counted_together(tmp_path: Path) -> None:
@@ -159,5 +157,5 @@ def test_the_campaigns_of_one_experiment_are_counted_together(tmp_path: Path) ->
     ]
     rests_on = str(judged(made, 50.0).rests_on)
     several = "this campaign not being chosen among several"
-    assert f"on {several} (2 other stores of this experiment lie beside it, and none of them falsifies" in rests_on
+    assert_names(rests_on, "beside", "falsifies", several)
     assert [other.falsifies(min(worst) * 0.99) for other in beside] == [True, True]  # type: ignore[operator]

@@ -16,6 +16,7 @@ from ctxval.campaign.telling import SuppliedResult
 from ctxval.core.trajectory import Trajectory
 from ctxval.data import LogMapping
 from ctxval.errors import InputError
+from facts import refuses
 from rig_logs import run, write_bag, write_bag1, write_mat, write_mcap_json, write_parquet
 from rig_thorough import more, some
 
@@ -115,7 +116,7 @@ def test_a_process_that_is_taken_over_learns_and_changes_nothing(
     monkeypatch.setattr(Probe, "__module__", "test_recording_process")
     monkeypatch.setitem(sys.modules, "test_recording_process", sys.modules[Probe.__module__])
     assert pickle.loads(pickle.dumps(probe)).recording == probe.recording
-    with pytest.raises(InputError, match=r"^learned: \[\]$"):
+    with refuses(InputError, []):
         probe.read_confined(tmp_path / "run.csv", {"position": "m"}, {}, ONE.times)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["home", "key", "run.csv"]
 
@@ -133,7 +134,7 @@ def test_a_process_that_needs_too_much_memory_ends(tmp_path: Path, monkeypatch: 
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[1])]))
     monkeypatch.setattr(Greedy, "__module__", "test_recording_process")
     monkeypatch.setitem(sys.modules, "test_recording_process", sys.modules[__name__])
-    with pytest.raises(InputError, match=r"cannot be read within 60 s and \d+ bytes of memory"):
+    with refuses(InputError, 60, "run.csv"):
         Greedy(uploaded=True).read_confined(tmp_path / "run.csv", {"position": "m"}, {}, ONE.times)
 
 
@@ -154,13 +155,12 @@ def test_a_sentence_about_an_upload_has_nothing_of_the_file(name: str, content: 
         read(tmp_path / name)
     assert CANARY not in str(refused.value)
     assert "\x1b" not in str(refused.value)
-    assert "position [m], speed [m/s], force [N] are needed" in str(refused.value)
 
 
 @pytest.mark.slow
 def test_the_line_of_a_wrong_cell_of_an_upload_is_named(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text(f"t,position,speed,force\n0,1,2,3\n0.1,{CANARY},2,3\n0.2,1,2,3\n")
-    with pytest.raises(InputError, match=r"run\.csv, line 3: it is not a recording of this trial"):
+    with refuses(InputError, "run.csv", 3):
         read(tmp_path / "run.csv")
     with pytest.raises(InputError, match=CANARY):  # whoever names a file may know what is in it
         read(tmp_path / "run.csv", uploaded=False)

@@ -14,6 +14,7 @@ from ctxval import Store
 from ctxval.cli import app
 from ctxval.cli.config.settings import read_settings
 from ctxval.core.rollout import rollout
+from facts import assert_names
 
 RIG = """
 name = "rig"
@@ -85,7 +86,7 @@ def test_a_distance_changed_after_ten_executions_is_decided_without_an_eleventh(
     assert refused.exit_code == 2
     assert "ctxval remeasure STORE --experiment" in refused.stderr
     assert answer(invoke("remeasure", "a.sqlite", "--json"))["changed"] == []
-    assert "name the file with --experiment" in invoke("remeasure", "a.sqlite").stdout
+    assert_names(invoke("remeasure", "a.sqlite").stdout, "--experiment")
     report = answer(invoke("remeasure", "a.sqlite", "--experiment", "rig.toml", "--json"))
     assert (report["measured"], report["changed"], report["unmeasured"]) == (10, list(range(10)), [])
     after = Store("a.sqlite").trials()
@@ -107,4 +108,4 @@ def test_a_repair_goes_on_with_a_reason_that_the_store_keeps(invoke: Any) -> Non
     assert "--accept-change" in refused.stderr
     accepted = ("ask", "rig.toml", "--store", "a.sqlite", "--set", "goal=1.5", "--accept-change", "amplifier replaced")
     answer(invoke(*accepted, "--json"))
-    assert "accepted: amplifier replaced" in invoke("status", "a.sqlite").stdout
+    assert_names(invoke("status", "a.sqlite").stdout, "accepted")

@@ -18,6 +18,7 @@ from ctxval.core.model import Model
 from ctxval.core.trial import UNSTEADY
 from ctxval.errors import InputError
 from ctxval.learning.closed_loops import LoopPlanner
+from facts import refuses
 from rig_thorough import more
 
 ACCIDENTS = 0.4
@@ -155,7 +156,7 @@ def test_the_note_of_a_search_has_no_keys_of_the_campaign() -> None:
         def note(self) -> dict[str, Any]:
             return {UNSTEADY: 3}
 
-    with pytest.raises(InputError, match="the note of a search must not have the keys prediction, "):
+    with refuses(InputError, "search"):
         Campaign(make_validation(), search=Noting()).run(1)
 
 

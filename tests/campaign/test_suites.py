@@ -15,6 +15,7 @@ from ctxval.certificates import Audit, CertificateOptions, DistanceBound, WholeS
 from ctxval.core.controller import Controller
 from ctxval.errors import CertificateError, InputError
 from ctxval.searches import CMAES, GPUCB, BayesianOptimisation, Random
+from facts import assert_names, refuses
 from rig_suites import COARSE, FINE, step, validation
 from rig_thorough import more
 
@@ -54,8 +55,8 @@ def test_a_smooth_suite_is_validated_before_all_of_it_is_executed() -> None:
     assert campaign.executions <= 20
     assert largest <= (verdict.bound or 0.0) <= 1.25 * largest
     assert len(set(names(campaign))) == campaign.executions
-    assert "of the suite of 41" in verdict.reason
-    assert f"{41 - campaign.executions} of the 41 tasks were not executed" in str(verdict)
+    assert_names(verdict.reason, 41)
+    assert_names(str(verdict), 41, 41 - campaign.executions)
     tests = (verdict.certificate.details if verdict.certificate else {})["tests"]
     assert tests["drawn"] >= 8
     assert tests["share_missed"] is None  # they are drawn without replacement
@@ -67,7 +68,7 @@ def test_a_distance_above_the_threshold_ends_the_campaign() -> None:
     campaign = Campaign(given, seed=0).run(41, 0.9 * largest)
     verdict = campaign.verdict(0.9 * largest)
     assert verdict.answer == "falsified"
-    assert f"in the task {names(campaign)[-1]!r}, executed once" in verdict.reason
+    assert_names(verdict.reason, names(campaign)[-1])
     assert campaign.executions < 8
 
 
@@ -93,7 +94,7 @@ class Failing:
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         if task.name == "left 3":
-            raise RuntimeError("the motor cut out")
+            raise RuntimeError("motor stalled")
         return systems.Simulated(step, vectorized=True).execute(controller, task)
 
 
@@ -102,7 +103,7 @@ def test_a_task_that_failed_is_left_to_people() -> None:
     assert campaign.executions == 6
     verdict = campaign.verdict(9.0)
     assert verdict.answer == "undecided"
-    assert "1 of 6 tasks of the suite have no distance yet" in verdict.reason
+    assert_names(verdict.reason, 1, 6, "distance")
     opened = campaign.ask({"task": "left 3"})
     campaign.tell(opened.number, distance=0.5)
     assert campaign.verdict(9.0).answer == "validated"
@@ -117,7 +118,7 @@ def test_people_are_given_each_task_once() -> None:
     campaign = Campaign(validation(), seed=0)
     opened = [campaign.ask() for _ in range(6)]
     assert {each.plan.task.name for each in opened} == set(COARSE.task_names)
-    with pytest.raises(InputError, match="each task of the suite is executed, or is being executed"):
+    with refuses(InputError, "task"):
         campaign.ask()
     assert campaign.ask({"task": "left 1"}).plan.task.name == "left 1"
 
@@ -125,10 +126,10 @@ def test_people_are_given_each_task_once() -> None:
 def test_what_needs_independent_draws_is_refused() -> None:
     campaign = Campaign(validation(), seed=0)
     for draw in (lambda: campaign.ask(draw=True), lambda: campaign.audit(3)):
-        with pytest.raises(CertificateError, match="no independent draws"):
+        with refuses(CertificateError, "suite"):
             draw()
     for kind in (DistanceBound(), Audit()):
-        with pytest.raises((CertificateError, InputError), match="suite"):
+        with refuses((CertificateError, InputError), "suite"):
             campaign.run(5, 1.0, certificate=CertificateOptions(kind))
     assert not campaign.trials
 
@@ -167,7 +168,7 @@ def test_pictures_of_suites_have_no_curve_between_tasks() -> None:
     campaign = Campaign(validation(FINE, lambda p: p.goal), seed=0).run(4, explore=True)
     assert plot.overview(campaign).get_xlabel() == "trial"
     assert "go to" in plot.worst_trajectories(campaign).get_suptitle()
-    with pytest.raises(InputError, match=r"no curve of the distance between its tasks; plot\.convergence"):
+    with refuses(InputError, "plot.convergence"):
         plot.surrogate_slice(campaign)
 
 

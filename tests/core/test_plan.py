@@ -13,6 +13,7 @@ from ctxval.core.plan import DistanceWarning, start_offset
 from ctxval.core.validation import CostWarning
 from ctxval.distances import AtCrossing, AtTimes, CrossingTime, FinalState, GoalError, RelativeDeviation, TrackingError
 from ctxval.errors import DesignError, DistanceError, InputError, UnknownNameError
+from facts import refuses, warns
 
 
 @pytest.mark.parametrize(
@@ -61,7 +62,7 @@ def test_a_controller_that_remembers_its_run_in_itself_costs_nothing(how: str) -
         return Campaign(make_validation().with_parts(synthesizer=policy), search=searches.Random())
 
     remembering, forgetting = campaign(False), campaign(True)
-    with pytest.raises(DesignError, match=r"must be the same if it runs again, and input 0 at step 0 is .* remembers"):
+    with refuses(DesignError, 0, "run"):
         {"run": lambda: remembering.run(1), "ask": remembering.ask}[how]()
     assert remembering.trials == ()
     forgetting.run(1)
@@ -71,7 +72,7 @@ def test_a_controller_that_remembers_its_run_in_itself_costs_nothing(how: str) -
 def test_a_model_that_is_random_costs_nothing() -> None:
     rng, linear = np.random.default_rng(0), make_validation().model
     campaign = Campaign(make_validation(model=lambda x, u: linear.step(x, u) + 0.1 * rng.normal(size=np.shape(x))))
-    with pytest.raises(DesignError, match="or is random"):
+    with refuses(DesignError, "models.Expected", 0):
         campaign.run(1)
     assert campaign.trials == ()
 
@@ -79,7 +80,7 @@ def test_a_model_that_is_random_costs_nothing() -> None:
 def test_a_task_function_that_is_random_costs_nothing() -> None:
     rng, plain = np.random.default_rng(0), make_validation().task
     campaign = Campaign(make_validation().with_parts(task=lambda p: plain(p).starting_at(rng.normal(size=2))))
-    with pytest.raises(InputError, match="must make the same task of the same parameters, and it made two"):
+    with refuses(InputError, "task", "function"):
         campaign.run(1)
     assert campaign.trials == ()
 
@@ -104,7 +105,7 @@ def test_a_distance_of_a_trajectory_with_itself_that_is_not_0_is_a_warning() -> 
         return np.abs(system.final_state - model.final_state).sum(axis=-1) + 0.1
 
     campaign = Campaign(make_validation().with_parts(distance=shifted), search=searches.Random())
-    with pytest.warns(DistanceWarning, match="and itself is 0.1, not 0"):
+    with warns(DistanceWarning, 0.1, 0):
         campaign.run(1)
     assert len(campaign.trials) == 1
     for to_task in (GoalError(), TrackingError()):
@@ -138,7 +139,7 @@ def test_every_distance_takes_states_by_name(name: str) -> None:
         indexed = cls(**required, **{option: by_name})
         assert named == indexed
         assert named.describe() == indexed.describe() if hasattr(named, "describe") else True
-        with pytest.raises(UnknownNameError, match="did you mean 'state 0'"):
+        with refuses(UnknownNameError, "state 0", 0):
             validation.with_parts(distance=cls(**required, **{option: "stat 0" if option == "state" else ["stat 0"]}))
 
 
@@ -160,12 +161,9 @@ def long(horizon: int, **options: Any) -> Validation:
 
 
 def test_a_horizon_that_is_too_long_is_refused_with_its_cost() -> None:
-    with pytest.raises(
-        InputError,
-        match=r"horizon of 10000000 needs about .* GB of memory and .* s of CPU time.*longest = 10000000 permits",
-    ):
+    with refuses(InputError, 10000000, "CPU"):
         Campaign(long(10**7)).ask()
-    with pytest.raises(InputError, match="at most 20 steps are permitted"):
+    with refuses(InputError, 20, "longest"):
         long(21, longest=20).plan([0.5])
     assert long(20, longest=20).plan([0.5]).task.horizon == 20
 
@@ -173,7 +171,7 @@ def test_a_horizon_that_is_too_long_is_refused_with_its_cost() -> None:
 def test_the_cost_of_a_long_horizon_is_stated_once() -> None:
     validation = long(60)
     validation.cost_stated_from = 50
-    with pytest.warns(CostWarning, match="each plan with a horizon of 60 needs about"):
+    with warns(CostWarning, 60):
         validation.plan([0.5])
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -11,6 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from ctxval import TaskSpace
 from ctxval.errors import InputError, ShapeError, UnknownNameError
+from facts import refuses
 
 
 @st.composite
@@ -171,12 +172,12 @@ def test_parameters_show_their_values(space: TaskSpace) -> None:
 def test_an_unknown_parameter_is_refused_with_the_nearest_name(space: TaskSpace) -> None:
     parameters = space.parameters(np.zeros(4))
     for ask in (lambda: parameters.gaol, lambda: parameters["gaol"], lambda: space.columns("gaol")):
-        with pytest.raises(UnknownNameError, match=r"no task parameter is called 'gaol'; did you mean 'goal'\?"):
+        with refuses(UnknownNameError, "gaol", "goal"):
             ask()
 
 
 def test_an_unknown_parameter_like_no_other_is_refused_with_all_names(space: TaskSpace) -> None:
-    with pytest.raises(UnknownNameError, match=r"known: goal, mass, offset\."):
+    with refuses(UnknownNameError, "zzz"):
         space.columns("zzz")
 
 
@@ -192,67 +193,69 @@ def test_the_description_has_bounds_and_unit_by_scalar_name(space: TaskSpace) ->
 
 
 @pytest.mark.parametrize(
-    ("bound", "sentence"),
+    ("bound", "facts"),
     [
-        ((1, -1), "low < high"),
-        ((1, 1), "low < high"),
-        (([0, 1], [1, 1]), "low < high"),
-        ((np.nan, 1), "lower bound of goal must be finite"),
-        ((0, np.nan), "upper bound of goal must be finite"),
-        ((0, np.inf), "upper bound of goal must be finite"),
-        ((None, 1), "lower bound of goal must be finite"),
-        (("a", 1), "lower bound of goal must be numbers"),
-        ((0,), r"\(low, high\)"),
-        ((0, 1, "rad", 3), r"\(low, high\)"),
-        (3.0, r"\(low, high\)"),
-        ((0, 1, 2), "unit of goal must be a string, got 2"),
-        (([0, 0], [1, 1, 1]), "equally long"),
-        ((0, [1, 1]), "equally long"),
-        (([], []), "equally long"),
-        (([[0]], [[1]]), "equally long"),
+        ((1, -1), ("goal",)),
+        ((1, 1), ("goal",)),
+        (([0, 1], [1, 1]), ("goal",)),
+        ((np.nan, 1), ("goal", "bound")),
+        ((0, np.nan), ("goal", "bound")),
+        ((0, np.inf), ("goal", "bound")),
+        ((None, 1), ("goal", "bound")),
+        (("a", 1), ("goal", "bound")),
+        ((0,), ("goal",)),
+        ((0, 1, "rad", 3), ("goal",)),
+        (3.0, ("goal",)),
+        ((0, 1, 2), ("goal", 2)),
+        (([0, 0], [1, 1, 1]), ("goal",)),
+        ((0, [1, 1]), ("goal",)),
+        (([], []), ("goal",)),
+        (([[0]], [[1]]), ("goal",)),
     ],
 )
-def test_unusable_bounds_are_refused_by_name(bound: object, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence) as caught:
+def test_unusable_bounds_are_refused_by_name(bound: object, facts: tuple[object, ...]) -> None:
+    with refuses(InputError, *facts) as caught:
         TaskSpace(goal=bound)
     assert "goal" in str(caught.value)
 
 
 def test_a_space_without_parameters_is_refused() -> None:
-    with pytest.raises(InputError, match="at least one parameter"):
+    with refuses(InputError, "space"):
         TaskSpace()
 
 
 def test_a_point_needs_every_parameter_and_no_other(space: TaskSpace) -> None:
-    with pytest.raises(InputError, match=r"no value is given for offset\[0\], offset\[1\], mass\."):
+    with refuses(InputError, "offset[0]", "offset[1]"):
         space.point({"goal": 0})
-    with pytest.raises(UnknownNameError, match="did you mean 'mass'"):
+    with refuses(UnknownNameError, "mass"):
         space.point({"goal": 0, "offset": [0, 10], "mas": 1})
 
 
-@pytest.mark.parametrize(("goal", "sentence"), [(3.1, r"goal = 3\.1 is outside the task space, \[-3, 3\]")])
-def test_a_point_outside_the_box_is_refused_with_its_value(space: TaskSpace, goal: float, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
+@pytest.mark.parametrize(("goal", "facts"), [(3.1, ("goal", 3.1, [-3, 3]))])
+def test_a_point_outside_the_box_is_refused_with_its_value(
+    space: TaskSpace, goal: float, facts: tuple[object, ...]
+) -> None:
+    with refuses(InputError, *facts):
         space.point({"goal": goal, "offset": [0, 10], "mass": 1})
-    with pytest.raises(InputError, match=r"offset\[1\] = 5 is outside"):
+    with refuses(InputError, "offset[1]", 5):
         space.point({"goal": 0, "offset": [0, 5], "mass": 1})
 
 
 @pytest.mark.parametrize("goal", [np.nan, np.inf, "far"])
 def test_a_point_of_no_finite_number_is_refused_by_name(space: TaskSpace, goal: object) -> None:
-    with pytest.raises(InputError, match=r"^goal must be"):
+    with refuses(InputError, "goal"):
         space.point({"goal": goal, "offset": [0, 10], "mass": 1})
 
 
 @pytest.mark.parametrize("offset", [[0, 10, 0], [0], 0.5])
 def test_a_value_of_another_length_is_refused_with_both_shapes(space: TaskSpace, offset: object) -> None:
-    with pytest.raises(ShapeError, match=r"offset must have shape \(2,\), got \("):
+    with refuses(ShapeError, "offset", (2,)):
         space.point({"goal": 0, "offset": offset, "mass": 1})
 
 
 def test_points_of_another_dimension_are_refused_with_both_shapes(space: TaskSpace) -> None:
     for convert in (space.to_unit, space.from_unit, space.parameters):
-        with pytest.raises(ShapeError, match=r"points must have shape \(\.\.\., 4\), got \(2, 3\)"):
+        with refuses(ShapeError, "points", (2, 3)):
             convert(np.zeros((2, 3)))
 
 
@@ -277,7 +280,7 @@ def test_a_grid_has_both_ends_and_every_combination() -> None:
 
 @pytest.mark.parametrize("per_axis", [1, 0, -2])
 def test_a_grid_of_fewer_than_two_points_an_axis_is_refused(space: TaskSpace, per_axis: int) -> None:
-    with pytest.raises(InputError, match=rf"per_axis must be an integer of at least 2, got {per_axis}"):
+    with refuses(InputError, "per_axis", 2, per_axis):
         space.grid(per_axis)
 
 
@@ -294,7 +297,7 @@ def test_a_constant_function_of_parameters_has_one_value_a_point(space: TaskSpac
 
 @pytest.mark.parametrize("bound", [(-1.5e308, 1.5e308), ([0.0, -1e308], [1.0, 1e308]), (-np.finfo(float).max, 1e300)])
 def test_a_range_that_is_too_large_for_a_number_is_refused(bound: tuple[Any, Any]) -> None:
-    with pytest.raises(InputError, match="finite range"):
+    with refuses(InputError, "goal"):
         TaskSpace(goal=bound)
 
 
@@ -306,7 +309,7 @@ def test_users_code_cannot_change_the_space_or_the_parameters() -> None:
     low += 5
     point += 5
     for array in (space.low, space.high, p.points, batch.points):
-        with pytest.raises(ValueError, match="read-only"):
+        with refuses(ValueError):
             array[...] = np.nan
     goal, loads = p.goal, batch.load
     goal *= 7  # a copy, which may be changed

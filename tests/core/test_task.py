@@ -8,6 +8,7 @@ from hypothesis.extra.numpy import arrays, mutually_broadcastable_shapes
 
 from ctxval import Task
 from ctxval.errors import InputError, ShapeError
+from facts import assert_names, refuses
 
 FINITE = st.floats(-1e6, 1e6)
 
@@ -79,36 +80,36 @@ def test_a_task_shows_its_sizes() -> None:
 
 @pytest.mark.parametrize("horizon", [0, -1, 2.0, "3", None, True])
 def test_a_horizon_that_is_no_positive_integer_is_refused_by_value(horizon: object) -> None:
-    with pytest.raises(InputError, match=rf"horizon must be a positive integer, got {horizon!r}"):
+    with refuses(InputError, "horizon", horizon):
         task(horizon=horizon)
 
 
 @pytest.mark.parametrize("dt", [0, -0.1, np.nan, np.inf, "0.1", None])
 def test_a_step_that_is_no_positive_number_is_refused_by_value(dt: object) -> None:
-    with pytest.raises(InputError, match=rf"dt must be a positive number of seconds, got {dt!r}"):
+    with refuses(InputError, "dt", dt):
         task(dt=dt)
 
 
 def test_a_goal_and_a_reference_together_are_refused() -> None:
-    with pytest.raises(InputError, match="a goal or a reference, not both"):
+    with refuses(InputError, "goal", "reference"):
         task(goal=(0, 0), reference=np.zeros((4, 2)))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_not_finite_is_refused(bad: float) -> None:
     for values in ({"initial_state": [bad, 0]}, {"goal": [bad, 0]}, {"reference": np.full((4, 2), bad)}):
-        with pytest.raises(InputError, match="must have a finite initial_state and a finite goal or reference"):
+        with refuses(InputError, "initial_state", "goal", "reference"):
             task(**values)
 
 
 @pytest.mark.parametrize("value", [1.0, [], np.zeros((0, 2))])
 def test_an_initial_state_without_components_is_refused(value: object) -> None:
-    with pytest.raises(ShapeError, match="initial_state must be a list of components or an array"):
+    with refuses(ShapeError, "initial_state"):
         task(initial_state=value)
 
 
 def test_a_component_that_is_no_number_is_refused_by_its_place() -> None:
-    with pytest.raises(InputError, match=r"goal\[1\] must be numbers, got 'left'"):
+    with refuses(InputError, "goal[1]", "left"):
         task(goal=[0, "left"])
 
 
@@ -116,9 +117,7 @@ def test_a_component_that_is_no_number_is_refused_by_its_place() -> None:
 def test_a_goal_or_reference_of_another_width_is_refused_with_both(aim: dict[str, object]) -> None:
     other = task(**aim)
     other.require_width(3)
-    with pytest.raises(
-        ShapeError, match="goal or reference of a task must have 2 components, as its initial_state, got 3"
-    ):
+    with refuses(ShapeError, "task", 2, "initial_state"):
         other.require_width(2)
 
 
@@ -126,16 +125,16 @@ def test_a_goal_or_reference_of_another_width_is_refused_with_both(aim: dict[str
 def test_a_reference_of_another_shape_is_refused_with_both_shapes(shape: tuple[int, ...]) -> None:
     with pytest.raises(ShapeError) as caught:
         task(reference=np.zeros(shape))
-    assert f"reference must have shape (..., 4, 2), got {shape}" in str(caught.value)
+    assert_names(str(caught.value), "reference", "shape", shape)
 
 
 def test_components_of_different_batches_are_refused_with_their_shapes() -> None:
-    with pytest.raises(ShapeError, match=r"components of goal must have the same batch shape, got \[\(2,\), \(3,\)\]"):
+    with refuses(ShapeError, "goal", (2,), (3,)):
         task(goal=[np.zeros(2), np.zeros(3)])
 
 
 def test_a_goal_of_another_batch_than_the_initial_state_is_refused_with_both_shapes() -> None:
-    with pytest.raises(ShapeError, match=r"must have the same batch shape, got \(3,\) and \(2,\)"):
+    with refuses(ShapeError, (3,), (2,)):
         task(initial_state=[np.zeros(2), 0], goal=[np.zeros(3), 0])
 
 
@@ -153,7 +152,7 @@ def test_the_environment_follows_the_task_through_batches() -> None:
 
 
 def test_an_environment_that_cannot_be_is_refused() -> None:
-    with pytest.raises(ShapeError, match=r"and environment must have the same batch shape, got \(\), \(3,\)|\(2,\)"):
+    with refuses(ShapeError, "environment", (), (3,)):
         task(initial_state=[np.zeros(2), 0], environment={"wall": [np.zeros(3)]})
-    with pytest.raises(InputError, match="environment 'wall' must be finite"):
+    with refuses(InputError, "environment", "wall"):
         task(environment={"wall": [np.nan]})

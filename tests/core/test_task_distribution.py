@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -15,6 +14,7 @@ from ctxval._util.describe import describe
 from ctxval.core.space import DISTRIBUTION
 from ctxval.core.task_distribution import distribution_text
 from ctxval.errors import InputError, UnknownNameError
+from facts import assert_names, refuses
 
 SPACE = TaskSpace(goal=(-1.0, 3.0, "rad"), load=([0.0, 0.0], [5.0, 2.0], "kg"))
 N = 20_000
@@ -97,33 +97,33 @@ def test_a_store_and_a_person_can_tell_distributions_apart() -> None:
         described = json.loads(json.dumps(describe(space)))[DISTRIBUTION]
         assert distribution_text(described) == text
         assert described == json.loads(json.dumps(describe(space)))[DISTRIBUTION]
-    assert distribution_text(SPACE.sampled(sampler).describe()[DISTRIBUTION]).startswith("tasks from the sampler ")
+    assert_names(distribution_text(SPACE.sampled(sampler).describe()[DISTRIBUTION]), "sampler")
     assert len(distribution_text({"goal": {"type": "x" * 10_000}})) < 1000
     assert distribution_text(3) == "3"
 
 
 def test_what_cannot_be_a_distribution_is_refused() -> None:
-    for given_, message in (
-        ({"goal": stats.poisson(3)}, "distribution of goal must be a Normal or a frozen continuous distribution"),
-        ({"goal": 3.0}, "must be a Normal or a frozen continuous distribution"),
-        ({"goal": Normal(1e6, 0.1)}, "the distribution of goal has no probability within its bounds"),
-        ({"goal": Normal([0.0, 1.0], 1.0)}, "must have one component or 1"),
-        ({"load": Normal([0.0, 1.0, 2.0], 1.0)}, "must have one component or 2"),
-        ({}, "needs the distribution of at least one parameter"),
+    for given_, facts in (
+        ({"goal": stats.poisson(3)}, ("goal", "scipy.stats.expon")),
+        ({"goal": 3.0}, ("goal", "scipy.stats.expon")),
+        ({"goal": Normal(1e6, 0.1)}, ("goal",)),
+        ({"goal": Normal([0.0, 1.0], 1.0)}, (1, "goal")),
+        ({"load": Normal([0.0, 1.0, 2.0], 1.0)}, (2, "load")),
+        ({}, ("distributed",)),
     ):
-        with pytest.raises(InputError, match=message):
+        with refuses(InputError, *facts):
             SPACE.distributed(**given_)
-    with pytest.raises(UnknownNameError, match="did you mean 'goal'"):
+    with refuses(UnknownNameError, "goal", "gaol"):
         SPACE.distributed(gaol=Normal(0, 1))
-    for mean, deviation in ((0.0, 0.0), (0.0, -1.0), (np.nan, 1.0)):
-        with pytest.raises(InputError, match="of a normal distribution must be"):
+    for mean, deviation, fact in ((0.0, 0.0, "deviation"), (0.0, -1.0, "deviation"), (np.nan, 1.0, "mean")):
+        with refuses(InputError, fact):
             Normal(mean, deviation)
-    with pytest.raises(InputError, match="sampler must be a function"):
+    with refuses(InputError, "sampler"):
         SPACE.sampled(np.zeros(3))  # type: ignore[arg-type]
-    for returned, message in (
-        (np.zeros((5, 2)), r"must return the shape \(5, 3\)"),
-        (np.full((5, 3), 9.0), "outside the bounds"),
-        (np.full((5, 3), np.nan), "finite"),
+    for returned, facts in (
+        (np.zeros((5, 2)), ((5, 3), "tasks")),
+        (np.full((5, 3), 9.0), ("sampler",)),
+        (np.full((5, 3), np.nan), ("sampler",)),
     ):
-        with pytest.raises(InputError, match=message):
+        with refuses(InputError, *facts):
             SPACE.sampled(lambda rng, n, rows=returned: rows).unit_draws(5, np.random.default_rng(0))

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from ctxval import Task, TaskSuite, Validation, controllers, distances, models, systems
 from ctxval.core.exchange import read_task, write_task
 from ctxval.errors import InputError, UnknownNameError
+from facts import refuses
 
 LIFTS = {
     "slow lift": {"speed": 0.2, "path": "lift"},
@@ -100,35 +101,35 @@ def test_tasks_are_called_by_their_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("tasks", "units", "message"),
+    ("tasks", "units", "facts"),
     [
-        ({"a": {"x": 1.0}}, None, "at least two tasks"),
-        (["a", "a"], None, "at least two tasks"),
-        ("ab", None, "at least two tasks"),
-        ({"a": {"x": 1.0}, "b": {"y": 1.0}}, None, "the same parameters: 'a' has x, 'b' has y"),
-        ({"a": {"x": 1.0}, "b": {"x": "one"}}, None, "a number in all tasks or a text in all tasks"),
-        ({"a": {"x": 1.0, "y": 2}, "b": {"x": 2.0, "y": 2}}, None, "y is 2 in all tasks: leave it out"),
-        ({"a": {"x": 1, "y": 1}, "b": {"x": 2, "y": 2}, "c": {"x": 1, "y": 1}}, None, "'a' and 'c' have the same"),
-        ({"a": {"x": float("nan")}, "b": {"x": 1.0}}, None, "x must be finite"),
-        ({"a": {"x": [1, 2]}, "b": {"x": [3, 4]}}, None, "one number or one text"),
-        ({"a": {}, "b": {}}, None, "has no parameters"),
-        ({"a": {"task": 1}, "b": {"task": 2}}, None, "must not be called 'task'"),
-        ({"a": {"x": 1.0}, "b": {"x": 2.0}}, {"y": "m"}, "no task parameter is called 'y'"),
+        ({"a": {"x": 1.0}}, None, ("tasks", "suite")),
+        (["a", "a"], None, ("tasks", "suite")),
+        ("ab", None, ("tasks", "suite")),
+        ({"a": {"x": 1.0}, "b": {"y": 1.0}}, None, ("a", "x", "b")),
+        ({"a": {"x": 1.0}, "b": {"x": "one"}}, None, ("tasks", "x")),
+        ({"a": {"x": 1.0, "y": 2}, "b": {"x": 2.0, "y": 2}}, None, ("y", 2)),
+        ({"a": {"x": 1, "y": 1}, "b": {"x": 2, "y": 2}, "c": {"x": 1, "y": 1}}, None, ("a", "c")),
+        ({"a": {"x": float("nan")}, "b": {"x": 1.0}}, None, ("x",)),
+        ({"a": {"x": [1, 2]}, "b": {"x": [3, 4]}}, None, ("x", [1, 2])),
+        ({"a": {}, "b": {}}, None, ("a",)),
+        ({"a": {"task": 1}, "b": {"task": 2}}, None, ("task", "suite")),
+        ({"a": {"x": 1.0}, "b": {"x": 2.0}}, {"y": "m"}, ("y", "task")),
     ],
 )
-def test_what_is_no_suite_is_refused(tasks: Any, units: Any, message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_what_is_no_suite_is_refused(tasks: Any, units: Any, facts: tuple[object, ...]) -> None:
+    with refuses((InputError, UnknownNameError), *facts):
         TaskSuite(tasks, units)
 
 
 def test_unknown_tasks_and_distributions_are_refused() -> None:
-    with pytest.raises(UnknownNameError, match="did you mean 'fast turn'"):
+    with refuses(UnknownNameError, "fast turn", "task"):
         SUITE.point({"task": "fast turns"})
-    with pytest.raises(UnknownNameError, match="no task is called 'x'"):
+    with refuses(UnknownNameError, "x", "task"):
         SUITE["x"]
-    with pytest.raises(InputError, match="given by its name"):
+    with refuses(InputError, "task", "speed"):
         SUITE.point({"speed": 0.2, "path": "lift"})
-    with pytest.raises(InputError, match="no distribution"):
+    with refuses(InputError, "suite"):
         SUITE.distributed()
-    with pytest.raises(InputError, match="no distribution"):
+    with refuses(InputError, "suite"):
         SUITE.sampled(lambda rng, n: rng.random((n, 2)))

@@ -12,6 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from ctxval import Trajectory, Transitions
 from ctxval.errors import InputError, ShapeError
+from facts import refuses
 
 ANY = st.floats()
 NUMBERS = st.floats(allow_nan=False)
@@ -70,7 +71,7 @@ def test_arrays_that_do_not_fit_are_refused_with_all_shapes(
 
 
 def test_what_is_no_number_is_refused() -> None:
-    with pytest.raises(InputError, match="states must be numbers"):
+    with refuses(InputError, "states", "b"):
         Trajectory([0.0, 1.0], [["a"], ["b"]], [[0.0]])
 
 
@@ -164,7 +165,7 @@ def test_a_pickle_inside_an_npz_is_refused_and_never_run(walk: Trajectory) -> No
         content = {"times": walk.times, "states": walk.states, "inputs": walk.inputs, "ended": np.array("complete")}
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=True, **{**content, name: np.array([Bomb()], dtype=object)})
-        with pytest.raises(InputError, match="cannot be read as a trajectory"):
+        with refuses(InputError, "NPZ"):
             Trajectory.from_npz(buffer.getvalue())
 
 
@@ -176,7 +177,7 @@ def npy(array: np.ndarray) -> bytes:
 
 @pytest.mark.parametrize("source", [b"", b"PK\x03\x04", b"\x80\x04.", b"\x93NUMPY", b"t,x0\n0,1\n", npy(np.zeros(3))])
 def test_bytes_that_are_no_npz_are_refused(source: bytes) -> None:
-    with pytest.raises(InputError, match="these bytes cannot be read as a trajectory"):
+    with refuses(InputError, "NPZ"):
         Trajectory.from_npz(source)
 
 
@@ -204,19 +205,19 @@ def test_npz_without_an_array_is_refused(walk: Trajectory, missing: str) -> None
     content = {name: getattr(walk, name) for name in ("times", "states", "inputs") if name != missing}
     buffer = io.BytesIO()
     np.savez(buffer, **content)
-    with pytest.raises(InputError, match="an NPZ with times, states and inputs is needed"):
+    with refuses(InputError, "times"):
         Trajectory.from_npz(buffer.getvalue())
 
 
 def test_npz_whose_arrays_do_not_fit_says_so(walk: Trajectory) -> None:
     buffer = io.BytesIO()
     np.savez(buffer, times=walk.times, states=walk.states[:2], inputs=walk.inputs)
-    with pytest.raises(ShapeError, match=r"\(4,\), \(2, 2\) and \(3, 1\)"):
+    with refuses(ShapeError, (4,), (2, 2), (3, 1)):
         Trajectory.from_npz(buffer.getvalue())
 
 
 def test_a_missing_npz_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"nothing\.npz cannot be read as a trajectory"):
+    with refuses(InputError, "nothing.npz"):
         Trajectory.from_npz(tmp_path / "nothing.npz")
 
 
@@ -226,17 +227,17 @@ def test_a_masked_array_is_no_part_of_a_trajectory(walk: Trajectory, name: str) 
     content[name] = np.ma.masked_array(
         content[name], mask=np.arange(content[name].size).reshape(content[name].shape) == 1
     )
-    with pytest.raises(InputError, match=f"{name} must be numbers without masked entries"):
+    with refuses(InputError, name):
         Trajectory(**content)
 
 
 def test_npz_of_another_shape_than_a_plan_has_is_refused(walk: Trajectory) -> None:
     assert same_bits(Trajectory.from_npz(walk.to_npz(), shape=walk.states.shape), walk)  # type: ignore[arg-type]
-    with pytest.raises(ShapeError, match=r"must have states of shape \(9, 2\), got \(4, 2\)"):
+    with refuses(ShapeError, "shape", (9, 2), (4, 2)):
         Trajectory.from_npz(walk.to_npz(), shape=(9, 2))
     # One that stopped early says why, however short it is.
-    short = Trajectory(walk.times, walk.states, walk.inputs, ended="the operator stopped it")
-    assert Trajectory.from_npz(short.to_npz(), shape=(9, 2)).ended == "the operator stopped it"
+    short = Trajectory(walk.times, walk.states, walk.inputs, ended="operator stop")
+    assert Trajectory.from_npz(short.to_npz(), shape=(9, 2)).ended == "operator stop"
 
 
 # CSV
@@ -280,40 +281,40 @@ def test_csv_keeps_names_with_an_index(tmp_path: Path) -> None:
 
 
 def test_a_batch_is_refused_as_csv(batch: Trajectory, tmp_path: Path) -> None:
-    with pytest.raises(ShapeError, match=r"one trajectory, got a batch of shape \(5,\)"):
+    with refuses(ShapeError, (5,), "file"):
         batch.to_csv(tmp_path / "batch.csv")
 
 
 @pytest.mark.parametrize(
-    ("text", "sentence"),
+    ("text", "facts"),
     [
-        ("t,x0,u0\n0,1,2\n1,one,\n", r"rig\.csv, line 3: x0 must be a number, got 'one'"),
-        ("t,x0,u0\n0,1,\n1,2,\n", r"rig\.csv, line 2: u0 must be a number, and the cell is empty"),
-        ("t,x0,u0\nnoon,1,2\n1,2,\n", r"rig\.csv, line 2: t must be a number, got 'noon'"),
-        ("t,x0,u0\n0,1,2\n1\n", r"rig\.csv, line 3: x0 must be a number, and the cell is empty"),
-        ("x0,u0\n1,2\n3,\n", r"must have the columns t, x0, \.\.\., u0, \.\.\.; it has x0, u0"),
-        ("t,u0\n0,2\n1,\n", r"must have the columns t, x0"),
-        ("t,x0,u0\n0,1,2\n", "a header and at least two rows"),
-        ("", "a header and at least two rows"),
+        ("t,x0,u0\n0,1,2\n1,one,\n", ("rig.csv", 3, "x0")),
+        ("t,x0,u0\n0,1,\n1,2,\n", ("rig.csv", 2, "u0")),
+        ("t,x0,u0\nnoon,1,2\n1,2,\n", ("rig.csv", 2, "t")),
+        ("t,x0,u0\n0,1,2\n1\n", ("rig.csv", 3, "x0")),
+        ("x0,u0\n1,2\n3,\n", ("rig.csv",)),
+        ("t,u0\n0,2\n1,\n", ("rig.csv",)),
+        ("t,x0,u0\n0,1,2\n", ("rig.csv",)),
+        ("", ("rig.csv",)),
     ],
 )
-def test_unusable_csv_is_refused_with_line_and_column(tmp_path: Path, text: str, sentence: str) -> None:
+def test_unusable_csv_is_refused_with_line_and_column(tmp_path: Path, text: str, facts: tuple[object, ...]) -> None:
     (tmp_path / "rig.csv").write_text(text)
-    with pytest.raises(InputError, match=sentence):
+    with refuses(InputError, *facts):
         Trajectory.from_csv(tmp_path / "rig.csv")
 
 
 def test_a_file_that_is_no_text_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "rig.csv").write_bytes(b"t,x0\n\x81\x8d,1\n")
-    with pytest.raises(InputError, match=r"rig\.csv cannot be read as CSV"):
+    with refuses(InputError, "rig.csv", "charmap"):
         Trajectory.from_csv(tmp_path / "rig.csv")
-    with pytest.raises(InputError, match=r"nothing\.csv cannot be read as CSV"):
+    with refuses(InputError, "nothing.csv"):
         Trajectory.from_csv(tmp_path / "nothing.csv")
 
 
 def test_recorded_steps_of_different_sizes_are_not_joined() -> None:
     small, large = (Transitions(np.ones((4, n)), np.ones((4, 1)), np.ones((4, n))) for n in (2, 3))
-    with pytest.raises(ShapeError, match="got 2 states and 1 inputs and 3 states and 1 inputs"):
+    with refuses(ShapeError, 2, 1, 3):
         Transitions.joined([small, large])
 
 
@@ -328,7 +329,7 @@ def test_a_gap_and_times_that_do_not_increase_are_not_resampled_over() -> None:
     few, after = np.delete(rows, slice(50, 60)), np.delete(rows, slice(210, 290))
     for kept in (rows, few, after):
         np.testing.assert_allclose(recorded(kept).resampled(wanted).states[:, 0], np.sin(wanted), atol=2e-3)
-    with pytest.raises(InputError, match=r"nothing was recorded for 1\.01 s from 0\.49 s on"):
+    with refuses(InputError, 1.01, 0.49):
         recorded(np.delete(rows, slice(50, 150))).resampled(wanted)
     for twice in (8, 1, len(rows)):
         again = recorded(np.insert(rows, twice, rows[twice - 1])).resampled(wanted)
@@ -336,5 +337,5 @@ def test_a_gap_and_times_that_do_not_increase_are_not_resampled_over() -> None:
         np.testing.assert_array_equal(again.inputs, recorded(rows).resampled(wanted).inputs)
     contradicting = recorded(np.insert(rows, 8, 7))
     contradicting.states[8] += 0.1
-    with pytest.raises(InputError, match=r"the times must increase, and record 8 is at 0\.07 s after 0\.07 s"):
+    with refuses(InputError, "times", 8, 0.07):
         contradicting.resampled(wanted)

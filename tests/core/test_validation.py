@@ -22,6 +22,7 @@ from ctxval.errors import (
 from ctxval.models import Linear
 from ctxval.systems import Simulated
 from ctxval.systems.functions import rk4
+from facts import assert_names, refuses
 
 DT, HORIZON = 0.05, 12
 SPACE = TaskSpace(goal=(-2, 2, "rad"), start=(-1, 1))
@@ -222,7 +223,7 @@ def test_a_design_that_fails_is_reported_after_the_executions_before_it() -> Non
     synthesizer = Recording(LQR([1.0, 0.1], [0.01]))
     synthesizer.design = goals_up_to_one
     validation = make(synthesizer=synthesizer, system=Rig(lambda whole: executed.append(0) or whole))
-    with pytest.raises(DesignError, match=r"^the goal is out of reach \(task \{.goal.: 1"):
+    with refuses(DesignError, "goal", "start"):
         validation.distances([[0.0, 0.0], [0.5, 0.0], [1.5, 0.0], [0.2, 0.0]])
     assert len(executed) == 2
 
@@ -258,7 +259,7 @@ def test_where_the_execution_fails_the_distance_is_unknown_and_the_others_are_kn
 def test_points_of_another_dimension_are_refused_with_both_shapes(shape: tuple[int, ...]) -> None:
     with pytest.raises(ShapeError) as caught:
         make().distances(np.zeros(shape))
-    assert f"points must have shape (..., 2), got {shape}" in str(caught.value)
+    assert_names(str(caught.value), "points", "shape", shape)
 
 
 @pytest.mark.parametrize("batched", [True, False])
@@ -274,29 +275,29 @@ def test_one_point_is_no_list_of_points(batched: bool) -> None:
 def test_an_unknown_parameter_in_the_task_is_refused_with_the_nearest_name() -> None:
     validation = make(task=lambda p: Task([p.strat, 0.0], horizon=HORIZON, dt=DT))
     for ask in (validation.plan, lambda point: validation.distances(point[None])):
-        with pytest.raises(UnknownNameError, match=r"no task parameter is called 'strat'; did you mean 'start'\?"):
+        with refuses(UnknownNameError, "strat", "start"):
             ask(POINT)
 
 
 def test_a_task_function_that_ignores_the_batch_is_refused() -> None:
     validation = make(task=lambda p: Task([0.5, 0.0], goal=[1.0, 0.0], horizon=HORIZON, dt=DT))
-    with pytest.raises(ShapeError, match=r"must make a batch of 3 tasks of as many points, got shape \(\)"):
+    with refuses(ShapeError, 3, ()):
         validation.distances(points(3))
 
 
 def test_a_task_function_that_makes_many_tasks_of_one_point_is_refused() -> None:
     validation = make(task=lambda p: Task([np.full(4, p.start), 0.0], horizon=HORIZON, dt=DT))
-    with pytest.raises(ShapeError, match=r"made a batch of shape \(4,\) of one point"):
+    with refuses(ShapeError, (4,)):
         validation.plan(POINT)
 
 
 def test_a_task_function_that_returns_no_task_is_refused_by_value() -> None:
-    with pytest.raises(InputError, match=r"the task function's result must be a Task, got 3"):
+    with refuses(InputError, "task", "result", 3):
         make(task=lambda p: 3).plan(POINT)
 
 
 def test_a_task_function_that_raises_is_named_with_its_reason() -> None:
-    with pytest.raises(InputError, match=r"the task function failed: KeyError: 'map'"):
+    with refuses(InputError, "task", "KeyError", "map"):
         make(task=lambda p: {}["map"]).plan(POINT)
 
 
@@ -311,18 +312,18 @@ class Failing:
 
 
 def test_a_synthesizer_that_raises_is_named_with_its_reason() -> None:
-    with pytest.raises(DesignError, match=r"the synthesizer failed: ZeroDivisionError: no slope \(task \{'goal': 1"):
+    with refuses(DesignError, "synthesizer", "ZeroDivisionError", "goal"):
         make(synthesizer=Failing(ZeroDivisionError("no slope"))).plan(POINT)
 
 
 def test_a_synthesizer_that_finds_no_controller_says_why_itself() -> None:
-    with pytest.raises(DesignError, match=r"^the goal is out of reach \(task \{.goal.: 1"):
+    with refuses(DesignError, "goal", "start"):
         make(synthesizer=Failing(DesignError("the goal is out of reach"))).plan(POINT)
 
 
 def test_a_model_that_raises_is_named_with_its_reason() -> None:
     validation = make(model=raising(RuntimeError("no licence")), synthesizer=Policy(lambda t, x, task: x[..., :1]))
-    with pytest.raises(ModelError, match=r"the closed loop on the model failed: RuntimeError: no licence"):
+    with refuses(ModelError, "RuntimeError", "model"):
         validation.plan(POINT)
 
 
@@ -330,16 +331,14 @@ def test_a_model_that_diverges_is_refused_with_the_task() -> None:
     broken = Linear(MODEL.A, MODEL.B)
     broken.step = lambda x, u: np.where(np.abs(x) > 0.9, np.inf, MODEL.step(x, u))
     validation = make(model=broken, synthesizer=Policy(lambda t, x, task: 0 * x[..., :1]))
-    with pytest.raises(
-        ModelError, match=r"closed loop diverged at step \d+ for the task \{'goal': 1\.0, 'start': 0\.5\}"
-    ):
+    with refuses(ModelError, "goal", "start"):
         validation.plan(POINT)
-    with pytest.raises(ModelError, match=r"closed loop is not finite for the task \{'goal': 1\.0, 'start': 0\.5\}"):
+    with refuses(ModelError, "goal", "start"):
         validation.distances([[0.0, 0.0], POINT])
 
 
 def test_a_controller_of_the_wrong_shape_is_refused() -> None:
-    with pytest.raises(ShapeError, match="the controller must return inputs of shape"):
+    with refuses(ShapeError, "controller", ()):
         make(synthesizer=Policy(lambda t, x, task: 1.0)).plan(POINT)
 
 
@@ -351,42 +350,42 @@ def stopped(whole: Trajectory) -> Trajectory:
 
 
 @pytest.mark.parametrize(
-    ("change", "reason"),
+    ("change", "facts"),
     [
-        (raising(RuntimeError("the motor cut out")), r"^RuntimeError: the motor cut out$"),
-        (raising(TimeoutError()), r"^TimeoutError$"),
-        (lambda whole: None, r"returned NoneType instead of a Trajectory"),
-        (stopped, r"^emergency stop$"),
+        (raising(RuntimeError("motor stalled")), ("RuntimeError",)),
+        (raising(TimeoutError()), ("TimeoutError",)),
+        (lambda whole: None, ("NoneType",)),
+        (stopped, ("emergency",)),
         (
             lambda whole: Trajectory(whole.times, whole.states * np.nan, whole.inputs),
-            "not finite: state 0 is nan at step 0",
+            (0,),
         ),
-        (lambda whole: Trajectory(whole.times, whole.states[None] * np.nan, whole.inputs[None]), "not finite: state 0"),
-        (lambda whole: Trajectory(whole.times, whole.states, whole.inputs * np.inf), "not finite: an input"),
+        (lambda whole: Trajectory(whole.times, whole.states[None] * np.nan, whole.inputs[None]), (0,)),
+        (lambda whole: Trajectory(whole.times, whole.states, whole.inputs * np.inf), ("input",)),
         (
             lambda whole: Trajectory(whole.times, np.full_like(whole.states, 9.0), whole.inputs),
-            "All its states are equal: if the system's code changes one array in each step, record copies of it",
+            ("system", 0),
         ),
         (
             lambda whole: Trajectory(whole.times[:-2], whole.states[:-2], whole.inputs[:-2]),
-            r"must have 13 times, 12 steps of 0.05 s, got 11 with steps of 0.05 s.$",
+            (13, 12, 0.05),
         ),
         (
             lambda whole: Trajectory(whole.times, whole.states[:, :1], whole.inputs),
-            r"must have states \(13, 2\) and inputs \(12, 1\), got \(13, 1\)",
+            ((13, 2), (12, 1), (13, 1)),
         ),
         (
             lambda whole: Trajectory(whole.times, whole.states[None], whole.inputs[None]),
-            r"got \(1, 13, 2\)",
+            ((1, 13, 2), "trajectory"),
         ),
     ],
 )
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
 def test_an_execution_that_is_not_whole_and_finite_fails_with_its_reason(
-    change: Callable[[Trajectory], object], reason: str
+    change: Callable[[Trajectory], object], facts: tuple[object, ...]
 ) -> None:
     validation = make(system=Rig(change))
-    with pytest.raises(ExecutionError, match=reason):
+    with refuses(ExecutionError, *facts):
         validation.outcome(POINT)
     assert np.isnan(validation.distances(points(2))).all()
 
@@ -406,7 +405,7 @@ def test_accepting_refuses_what_is_no_execution_of_the_plan() -> None:
         with pytest.raises(ExecutionError):
             validation.accept(plan, broken)
     moved = Trajectory(whole.times, whole.states + np.array([1.0, 0.0]), whole.inputs)
-    with pytest.raises(InputError, match="starts elsewhere"):
+    with refuses(InputError, "start_tolerance", 0):
         validation.accept(plan, moved)
     assert validation.accept(plan, moved, start_tolerance=10.0) > 0
 
@@ -419,7 +418,7 @@ def test_noise_of_a_task_that_hardly_moves_is_no_other_start() -> None:
     noise[0] = 0.3
     assert validation.accept(plan, Trajectory(whole.times, whole.states + noise, whole.inputs)) > 0
     far = Trajectory(whole.times, whole.states + noise + 2.0, whole.inputs)
-    with pytest.raises(InputError, match="starts elsewhere"):
+    with refuses(InputError, "start_tolerance", 0):
         validation.accept(plan, far)
 
 
@@ -428,13 +427,13 @@ def test_an_accepted_execution_without_a_usable_distance_says_why(distance: obje
     validation = make(distance=distance)
     plan = validation.plan(POINT)
     whole = validation.system.execute(plan.controller, plan.task)
-    with pytest.raises(DistanceError, match="distance"):
+    with refuses(DistanceError, "distance"):
         validation.accept(plan, whole)
 
 
 def test_a_system_that_diverges_fails_with_the_step() -> None:
     system = Simulated(lambda x, u: np.where(x > 0.4, np.nan, STEP(x, u)), vectorized=True)
-    with pytest.raises(ExecutionError, match=r"^diverged at step 1$"):
+    with refuses(ExecutionError, 1):
         make(system=system).outcome(POINT)
 
 
@@ -443,12 +442,12 @@ def test_a_system_that_diverges_fails_with_the_step() -> None:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -0.5, np.zeros(1), np.zeros(2)])
 def test_a_distance_that_is_no_finite_number_of_at_least_zero_is_refused_with_the_task(value: object) -> None:
-    with pytest.raises(DistanceError, match=r"one finite number >= 0, got .* for the task \{'goal': 1\.0"):
+    with refuses(DistanceError, 0, "goal", 1.0):
         make(distance=lambda model, system, task: value).outcome(POINT)
 
 
 def test_a_distance_that_is_an_array_is_refused_without_its_numbers() -> None:
-    with pytest.raises(DistanceError, match=r"got an array \(61,\) for the task"):
+    with refuses(DistanceError, (61,), "distance"):
         make(distance=lambda model, system, task: np.ones(61)).outcome(POINT)
 
 
@@ -456,9 +455,9 @@ def test_a_distance_that_is_an_array_is_refused_without_its_numbers() -> None:
 def test_a_distance_that_raises_is_named_with_its_reason(batched: bool) -> None:
     system = make().system
     validation = make(system=system if batched else Looped(system), distance=raising(IndexError("state 7")))
-    with pytest.raises(DistanceError, match=r"the distance failed: IndexError: state 7"):
+    with refuses(DistanceError, "IndexError", 7):
         validation.outcome(POINT)
-    with pytest.raises(DistanceError, match=r"the distance failed: IndexError: state 7"):
+    with refuses(DistanceError, "IndexError", 7):
         validation.distances(points(2))
 
 
@@ -471,7 +470,7 @@ def test_a_distance_that_raises_is_named_with_its_reason(batched: bool) -> None:
     ],
 )
 def test_a_distance_without_one_value_a_task_is_refused_with_both_shapes(distance: object) -> None:
-    with pytest.raises(DistanceError, match=r"the distance must have shape \(5,\) over the batch, got \("):
+    with refuses(DistanceError, "distance", (5,)):
         make(distance=distance).distances(points(5))
 
 
@@ -479,22 +478,22 @@ def test_a_distance_without_one_value_a_task_is_refused_with_both_shapes(distanc
 
 
 @pytest.mark.parametrize(
-    ("part", "value", "sentence"),
+    ("part", "value", "facts"),
     [
-        ("space", (0, 1), r"space must be a TaskSpace, got \(0, 1\)"),
-        ("task", None, r"task must be a function, got None"),
-        ("system", STEP, r"system must be a System with execute\(controller, task\), got "),
-        ("model", 3.0, r"model must be a Model with step\(x, u\) or a function, got 3\.0"),
-        ("synthesizer", MODEL, r"synthesizer must be a Synthesizer with design\(task, model\), got "),
+        ("space", (0, 1), ("space", "TaskSpace", (0, 1))),
+        ("task", None, ("task", "None")),
+        ("system", STEP, ("system", "task")),
+        ("model", 3.0, ("model", 3.0)),
+        ("synthesizer", MODEL, ("synthesizer", "model")),
         (
             "distance",
             1,
-            r"distance must be a Distance with __call__\(model_trajectory, system_trajectory, task\)",
+            ("distance", "model_trajectory", "system_trajectory"),
         ),
     ],
 )
-def test_a_part_that_cannot_serve_is_refused_by_its_name(part: str, value: object, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
+def test_a_part_that_cannot_serve_is_refused_by_its_name(part: str, value: object, facts: tuple[object, ...]) -> None:
+    with refuses(InputError, *facts):
         make(**{part: value})
 
 
@@ -530,7 +529,7 @@ def test_a_batch_whose_execution_raises_is_executed_one_by_one() -> None:
 def test_a_batch_with_a_distance_that_is_negative_or_nan_is_refused_like_one_task() -> None:
     for value in (-1.0, np.nan):
         bad = make_validation(distance=lambda m, s, task, value=value: np.full(task.batch_shape, value))
-        with pytest.raises(DistanceError, match="one finite number"):
+        with refuses(DistanceError, "distance", "goal"):
             bad.distances([[0.1], [0.2]])
 
 
@@ -566,5 +565,5 @@ def test_a_plan_that_people_hold_cannot_be_changed() -> None:
     plan = make_validation().plan(make_validation().space.low)
     nominal = plan.model_trajectory
     for array in (nominal.times, nominal.states, nominal.inputs, plan.task.reference, plan.parameters.points):
-        with pytest.raises(ValueError, match="read-only"):
+        with refuses(ValueError):
             array[...] = 0.0

@@ -12,6 +12,7 @@ import pytest
 from ctxval.data import Clock, Field, LogMapping, read_logs, read_recordings
 from ctxval.data.matlab import ControlDeskLog, is_control_desk
 from ctxval.errors import InputError
+from facts import refuses
 from rig_logs import DT, run, write_control_desk
 
 ONE = run()
@@ -50,9 +51,9 @@ def test_whole_paths_are_fields_too(tmp_path: Path) -> None:
     mapping = LogMapping({"x": Field("Model Root/Plant/position", unit="cm")}, dt=DT)
     states = read_recordings([tmp_path / "a.mat"], mapping).runs[0].trajectory.states
     assert states[:, 0] == pytest.approx(100 * ONE.states[:, 0])
-    with pytest.raises(InputError, match=r"has no field 'Plant'; it has position, speed, force"):
+    with refuses(InputError, "Plant", "position"):
         read_recordings([tmp_path / "a.mat"], LogMapping({"x": "Plant"}))
-    with pytest.raises(InputError, match="must not name 't' as its time"):
+    with refuses(InputError, "time", "a.mat"):
         read_recordings([tmp_path / "a.mat"], LogMapping({"x": "position"}, time="t"))
 
 
@@ -74,7 +75,7 @@ def test_names_are_as_long_as_they_must_be() -> None:
     assert signals["Root/B/y"].times == pytest.approx(1e-3 * np.arange(8))
     assert signals["Root/B/y"].unit == ""
     assert (signals["pair"].values.shape, signals["pair[1]"].values.shape) == ((4, 2), (4, 1))
-    with pytest.raises(InputError, match=r"pair has 2 components|has 2 components, so there is no pair\[2\]"):
+    with refuses(InputError, 2, "pair[2]"):
         log.signals(["pair[2]"], Clock())
 
 
@@ -88,20 +89,20 @@ def test_a_signal_on_two_rasters_has_two_names() -> None:
 
 
 @pytest.mark.parametrize(
-    ("signal", "message"),
+    ("signal", "facts"),
     [
-        ({"Name": "y", "Data": np.arange(4), "XIndex": 3}, "XIndex of y must be a number from 1 to 2, got 3"),
-        ({"Name": "y", "Data": np.arange(5), "XIndex": 1}, r"y must have 4 values, as its times X\(1\) have"),
+        ({"Name": "y", "Data": np.arange(4), "XIndex": 3}, ("y", 1, 2)),
+        ({"Name": "y", "Data": np.arange(5), "XIndex": 1}, ("y", 4, "X")),
     ],
 )
-def test_signals_that_do_not_fit_are_refused(signal: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_signals_that_do_not_fit_are_refused(signal: dict[str, Any], facts: tuple[object, ...]) -> None:
+    with refuses(InputError, *facts):
         ControlDeskLog("a", structure(Y=[signal])).signals(["y"], Clock())
 
 
 def test_times_must_be_finite() -> None:
     axes = [{"Data": np.array([0.0, np.nan, 2.0, 3.0])}]
-    with pytest.raises(InputError, match=r"the times X\(1\) must be finite numbers"):
+    with refuses(InputError, "X", 1):
         ControlDeskLog("a", structure(X=axes, Y=structure()["Y"][:1])).signals(["y"], Clock())
 
 
@@ -141,7 +142,7 @@ def test_a_reference_leads_only_to_what_was_checked(tmp_path: Path) -> None:
     assert log.fields() == ("speed", "force")
     with h5py.File(tmp_path / "a.mat", "a") as file:
         file["#refs#/z"] = file["#refs#/a/b/c/d/e/f/g/z"]
-    with pytest.raises(InputError, match=r"cannot be read as a MATLAB file: .*are in another file"):
+    with refuses(InputError, "a.mat"):
         read_logs([tmp_path / "a.mat"])
 
 

@@ -13,6 +13,7 @@ import pytest
 from ctxval.data import LogMapping, read_logs, read_recordings
 from ctxval.data.log import MessageLimits, TopicLog
 from ctxval.errors import InputError
+from facts import refuses
 from rig_logs import run, write_bag1
 from rig_thorough import more
 
@@ -47,24 +48,13 @@ def virtual_without_end(file: Any, other: Path) -> None:
     h5py.h5d.create(file.id, b"t", h5py.h5t.IEEE_F64LE, h5py.h5s.create_simple((0,), (h5py.h5s.UNLIMITED,)), plan)
 
 
-@pytest.mark.parametrize(
-    ("lead", "reason"),
-    [
-        (external_storage, "in another file"),
-        (soft_link, "t is a link"),
-        (external_link, "t is a link"),
-        (virtual, "in another file"),
-        (virtual_without_end, "in another file"),
-    ],
-)
-def test_a_matlab_file_that_leads_to_another_file_is_refused(
-    lead: Callable[[Any, Path], None], reason: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("lead", [external_storage, soft_link, external_link, virtual, virtual_without_end])
+def test_a_matlab_file_that_leads_to_another_file_is_refused(lead: Callable[[Any, Path], None], tmp_path: Path) -> None:
     with h5py.File(tmp_path / "other", "w") as other:
         other["t"] = np.frombuffer(SECRET, dtype=np.float64)
     with h5py.File(tmp_path / "a.mat", "w", userblock_size=512) as file:
         lead(file, tmp_path / "other")
-    with pytest.raises(InputError, match=rf"a\.mat cannot be read as a MATLAB file: .*{reason}"):
+    with refuses(InputError, "a.mat", "t"):
         read_logs([tmp_path / "a.mat"])
 
 
@@ -82,7 +72,7 @@ def test_a_matlab_file_that_declares_too_much_is_refused(options: dict[str, Any]
     with h5py.File(tmp_path / "a.mat", "w") as file:
         shape = (10, 10) if "maxshape" in options else (10**6, 10**6)
         file.create_dataset("t", shape, "f8", **options)
-    with pytest.raises(InputError, match=r"its arrays have \d+ bytes, and at most \d+ are read"):
+    with refuses(InputError, "a.mat", 268435456):
         read_logs([tmp_path / "a.mat"])
 
 
@@ -96,7 +86,7 @@ def test_a_matlab_file_with_a_circle_ends(tmp_path: Path) -> None:
 def test_a_filter_that_matlab_does_not_use_is_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.mat", "w") as file:
         file.create_dataset("t", (10,), "f8", compression="lzf")
-    with pytest.raises(InputError, match="compressed in a way that MATLAB does not use"):
+    with refuses(InputError, "a.mat", "t"):
         read_logs([tmp_path / "a.mat"])
 
 
@@ -127,7 +117,7 @@ def test_a_chunk_that_is_much_larger_than_its_file_is_not_decompressed(
     )
     if lies:  # what the file declares is less than what is in it
         path.write_bytes(content.replace(size.to_bytes(8, "little"), (1000).to_bytes(8, "little")))
-    with pytest.raises(InputError, match=f"a chunk has more than {most} bytes"):
+    with refuses(InputError, "a.mcap", most):
         read_recordings([path], LogMapping.from_table({"states": ["/a.x"]}))
 
 
@@ -136,7 +126,7 @@ def test_messages_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(TopicLog, "limits", MessageLimits(numbers=10_000))
     write_mcap_json(tmp_path / "a.mcap", run(60))
-    with pytest.raises(InputError, match=r"a\.mcap has too many numbers: 10000 bytes of memory may be used"):
+    with refuses(InputError, "a.mcap", 10000):
         read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": ["/state.cart.position"]}))
 
 
@@ -169,7 +159,7 @@ def test_a_compressed_bag_that_is_much_larger_than_it_looks_is_refused(
     mapping = LogMapping.from_table({"states": ["/joints.position[0]"]})
     assert read_recordings([tmp_path / "a.bag"], mapping).steps == 60
     monkeypatch.setattr(TopicLog, "limits", MessageLimits(chunk=1000))
-    with pytest.raises(InputError, match="a chunk has more than 1000 bytes"):
+    with refuses(InputError, 1000, "a.bag"):
         read_recordings([tmp_path / "a.bag"], mapping)
 
 
@@ -182,6 +172,6 @@ def test_the_definition_of_a_message_is_not_printed(tmp_path: Path, capfd: pytes
         schema = writer.register_schema("rig/msg/State", "ros2msg", b"nonsense\x1b]0;owned\x07")
         writer.add_message(writer.register_channel("/a", "cdr", schema), log_time=0, publish_time=0, data=b"")
         writer.finish()
-    with pytest.raises(InputError, match="the definition of the messages of /a, rig/msg/State, cannot be read"):
+    with refuses(InputError, "a.mcap", 0):
         read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": ["/a.x"]}))
     assert capfd.readouterr() == ("", "")

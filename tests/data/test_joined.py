@@ -10,6 +10,7 @@ import pytest
 
 from ctxval.data import LogMapping, read_logs, read_recordings
 from ctxval.errors import InputError
+from facts import refuses
 
 FAST = 0.004 * np.arange(500)
 SLOW = 0.1 * np.arange(20)
@@ -77,7 +78,7 @@ def test_damaged_parts_of_a_log_of_px4_are_said(tmp_path: Path, capsys: pytest.C
 def test_a_damaged_log_of_px4_is_refused(content: bytes, tmp_path: Path) -> None:
     pytest.importorskip("pyulog")
     (tmp_path / "a.ulg").write_bytes(content)
-    with pytest.raises(InputError, match=r"a\.ulg"):
+    with refuses(InputError, "a.ulg"):
         read_logs([tmp_path / "a.ulg"])
 
 
@@ -100,7 +101,7 @@ def test_a_field_of_several_topics_is_named_with_its_topic(tmp_path: Path) -> No
     assert set(log.fields()) == {"left.speed", "left", "right.speed", "right"}
     (run,) = read_recordings([tmp_path], LogMapping.from_table({"states": {"v": {"path": "right.speed"}}})).runs
     np.testing.assert_allclose(run.trajectory.states[:, 0], -run.trajectory.times, atol=1e-6)
-    with pytest.raises(InputError, match="has no field 'speed'"):
+    with refuses(InputError, "speed"):
         read_recordings([tmp_path], LogMapping.from_table({"states": ["speed"]}))
 
 
@@ -142,7 +143,7 @@ def test_times_of_several_files_are_measured_as_those_of_one(tmp_path: Path) -> 
         rows = [f"{1000 * time:.0f},{value}" for time, value in zip(times, values, strict=True)]
         (tmp_path / f"{name}.csv").write_text("\n".join([f"t,{'angle' if 'pos' in name else 'speed'}", *rows]))
     mapping = LogMapping.from_table({"states": {"angle": "angle", "speed": "speed"}, "inputs": {}})
-    with pytest.raises(InputError, match=r"as if t were in ms: a step would take 0\.004 s instead of 4 s"):
+    with refuses(InputError, 0.004, 4):
         read_recordings([tmp_path], mapping)
     assert read_recordings([tmp_path], mapping, time_unit="ms").dt == 0.004
 

@@ -11,6 +11,7 @@ import pytest
 from ctxval._util.columns import conversion
 from ctxval.data import Field, LogMapping, MemoryTable
 from ctxval.errors import InputError, UnknownNameError
+from facts import refuses
 
 TOML = """
 [recordings]
@@ -50,50 +51,50 @@ def test_a_mapping_in_toml_is_that_in_python(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "facts"),
     [
-        ({"states": {}}, "a mapping of a log needs at least one state"),
-        ({"observer": 3}, "an observer must name a function module:attr, got 3"),
-        ({"observer": {"functon": "a:b"}}, "an observer must name a function module:attr"),
-        ({"observer": {"function": "a:b", "state": {}}}, "no entry of the observer is called 'state'"),
-        ({"observer": {"function": "a:b", "states": {"x": 3}}}, "states must be"),
-        ({"dt": 0}, "dt must be a positive number of seconds, got 0"),
-        ({"dt": True}, "dt must be a positive number of seconds, got True"),
-        ({"longest_gap": -1}, "longest_gap must be a positive number"),
-        ({"delay": float("inf")}, "delay must be a finite number"),
-        ({"stamp": "lag"}, "no stamp is called 'lag'; did you mean 'log'"),
-        ({"time_unit": "week"}, "no known factor from week to s"),
-        ({"inputs": {"x": "u"}}, "x is a state and an input: give them different names"),
-        ({"inputs": 3}, "inputs must be a table of fields or a list of paths, got 3"),
-        ({"inputs": {"u": 3}}, "the field u must be a path or a table, got 3"),
-        ({"inputs": {"u": ""}}, "the path of a field must be a text, got ''"),
-        ({"inputs": {"u": {"factr": 2}}}, "entry of the field u is called 'factr'; did you mean 'factor'"),
-        ({"inputs": {"u": {"factor": "2"}}}, "the field u: factor must be a finite number, got '2'"),
-        ({"inputs": {"u": {"recorded": "deg", "unit": "m"}}}, "the field u: there is no known factor from deg to m"),
+        ({"states": {}}, ("log",)),
+        ({"observer": 3}, ("observer", 3)),
+        ({"observer": {"functon": "a:b"}}, ("observer", "function")),
+        ({"observer": {"function": "a:b", "state": {}}}, ("observer", "state")),
+        ({"observer": {"function": "a:b", "states": {"x": 3}}}, ("states", "x")),
+        ({"dt": 0}, ("dt", 0)),
+        ({"dt": True}, ("dt", "True")),
+        ({"longest_gap": -1}, ("longest_gap", -1)),
+        ({"delay": float("inf")}, ("delay", "inf")),
+        ({"stamp": "lag"}, ("stamp", "lag", "log")),
+        ({"time_unit": "week"}, ("week", "factor")),
+        ({"inputs": {"x": "u"}}, ("x",)),
+        ({"inputs": 3}, ("inputs", 3)),
+        ({"inputs": {"u": 3}}, ("u", 3)),
+        ({"inputs": {"u": ""}}, ("field",)),
+        ({"inputs": {"u": {"factr": 2}}}, ("u", "factr", "factor")),
+        ({"inputs": {"u": {"factor": "2"}}}, ("u", "factor", "2")),
+        ({"inputs": {"u": {"recorded": "deg", "unit": "m"}}}, ("u", "deg", "m")),
         (
             {"inputs": {"u": {"recorded": "furlong", "unit": "m"}}},
-            "there is no known factor from furlong to m: give fac",
+            ("furlong", "m"),
         ),
-        ({"delays": 1}, "no entry of the mapping of recordings is called 'delays'; did you mean 'delay'"),
+        ({"delays": 1}, ("delays",)),
     ],
 )
-def test_an_unusable_mapping_is_refused(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_an_unusable_mapping_is_refused(change: dict[str, Any], facts: tuple[object, ...]) -> None:
+    with refuses((InputError, UnknownNameError), *facts):
         LogMapping.from_table({"states": {"x": "x"}, **change})
 
 
 def test_a_mapping_needs_states() -> None:
-    with pytest.raises(InputError, match="needs states"):
+    with refuses(InputError, "recordings"):
         LogMapping.from_table({"inputs": ["u"]})
     with pytest.raises(UnknownNameError):
         LogMapping.from_table({"state": ["x"]})
 
 
-@pytest.mark.parametrize(("content", "message"), [("a = [", "is not valid TOML"), (None, "cannot be read")])
-def test_a_file_that_is_no_mapping_is_refused(content: str | None, message: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("content", "fact"), [("a = [", "a.toml"), (None, "a.toml")])
+def test_a_file_that_is_no_mapping_is_refused(content: str | None, fact: object, tmp_path: Path) -> None:
     if content is not None:
         (tmp_path / "a.toml").write_text(content)
-    with pytest.raises(InputError, match=message):
+    with refuses(InputError, fact):
         LogMapping.from_toml(tmp_path / "a.toml")
 
 
@@ -101,7 +102,7 @@ def test_usual_names_need_no_mapping() -> None:
     columns = {name: np.zeros(3) for name in ("t", "x1", "x0", "u0", "note")}
     usual = LogMapping.usual(MemoryTable("log", columns))
     assert (list(usual.states), list(usual.inputs)) == (["x0", "x1"], ["u0"])
-    with pytest.raises(InputError, match=r"log has no states under a usual name .* the fields are t, note"):
+    with refuses(InputError, "log", "note"):
         LogMapping.usual(MemoryTable("log", {"t": np.zeros(3), "note": np.zeros(3)}))
 
 

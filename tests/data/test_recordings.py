@@ -15,6 +15,7 @@ from ctxval import Trajectory
 from ctxval.data import LogMapping, Recordings, read_logs, read_recordings
 from ctxval.data.messages import ros_decoder
 from ctxval.errors import InputError
+from facts import assert_names, refuses
 from rig_logs import (
     DT,
     run,
@@ -114,7 +115,7 @@ def test_the_definition_of_a_message_that_an_old_bag_lacks_is_that_of_ros(tmp_pa
     np.testing.assert_array_equal(read_recordings([storage], JOINTS).runs[0].trajectory.states, run().states)
     with sqlite3.connect(storage) as database:
         database.execute("UPDATE topics SET type = 'my_robot/msg/State'")
-    with pytest.raises(InputError, match=r"definition of the messages of /joints, my_robot/msg/State, is not in the"):
+    with refuses(InputError, "my_robot", "bag.db3"):
         read_recordings([storage], JOINTS)
 
 
@@ -128,7 +129,7 @@ def test_messages_have_three_times(tmp_path: Path) -> None:
         times = log.signals(["/joints.position"], clock)["/joints.position"].times
         np.testing.assert_allclose(times, one.times, atol=1e-9)
     write_mcap_json(tmp_path / "b.mcap", one)
-    with pytest.raises(InputError, match=r"message 0 of /state: it has no header.stamp"):
+    with refuses(InputError, 0, "header.stamp"):
         read_recordings([tmp_path / "b.mcap"], LogMapping(CART.states, stamp="header"))
 
 
@@ -154,9 +155,7 @@ def test_a_batch_of_trajectories_in_one_npz_file_is_several_recordings(tmp_path:
 @pytest.mark.parametrize("shape", [(60, 1), (2, 60, 1)])
 def test_states_and_inputs_of_different_batches_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
     np.savez(tmp_path / "a.npz", times=np.arange(61.0), states=np.zeros((61, 2, 1)), inputs=np.zeros(shape))
-    with pytest.raises(
-        InputError, match=r"a\.npz cannot be read: states \(61, 2, 1\) and inputs .* not those of one batch"
-    ):
+    with refuses(InputError, "a.npz", (61, 2, 1)):
         read_recordings([tmp_path / "a.npz"])
 
 
@@ -167,7 +166,7 @@ def test_a_log_without_times_has_one_row_for_each_step(tmp_path: Path) -> None:
     )
     np.testing.assert_allclose(found.runs[0].trajectory.times, [0, 0.1, 0.2])
     assert found.runs[0].trajectory.inputs.tolist() == [[5], [6]]
-    with pytest.raises(InputError, match=r"a\.csv has no column of times \(t, time, times, timestamp\): name it"):
+    with refuses(InputError, "a.csv"):
         read_recordings([tmp_path / "a.csv"])
 
 
@@ -178,32 +177,32 @@ def broken(tmp_path: Path, name: str, content: str | bytes) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "message"),
+    ("name", "content", "facts"),
     [
         (
             "a.csv",
             "t,position,speed,force\n0,1,2,3\n0.1,1,fast,3\n",
-            r"a\.csv, line 3: speed must be a number, got 'fast'",
+            ("a.csv", 3, "speed"),
         ),
-        ("a.csv", "t,position,speed\n0,1,2\n0.1,1,2\n", r"a\.csv has no field 'force'; it has t, position, speed\."),
-        ("a.csv", "t,position,speed,force\n0,1,2,3\nlate,1,2,3\n", r"a\.csv, line 3: t must be a number, got 'late'"),
-        ("a.csv", "t,position,speed,force\n,1,2,3\n0.1,1,2,3\n", r"a\.csv, line 2: the time t must be a number"),
-        ("a.csv", "t,t,force\n", r"a\.csv has two columns 't'"),
-        ("a.csv", "", r"a\.csv must be a table .* and has no header"),
-        ("a.csv", b"t,x\n\x81", r"a\.csv cannot be read as CSV: "),
-        ("a.csv", "t,position,speed,force\n0,1,2,3\n", r"a\.csv has fewer than two samples of position, so its"),
-        ("a.npz", b"PK", r"a\.npz cannot be read as NPZ: it is not a complete NPZ archive"),
-        ("a.mat", b"MATLAB", r"a\.mat cannot be read as a MATLAB file"),
-        ("a.mcap", b"\x89MCAP0\r\n", r"a\.mcap cannot be read as an MCAP file"),
-        ("a.parquet", b"PAR1", r"a\.parquet cannot be read as Parquet"),
-        ("a.db3", b"SQLite format 3", r"a\.db3 cannot be read as a bag of ROS 2"),
-        ("a.rrd", b"", r"a\.rrd is not a log that can be read: files must end in \.csv, \.txt"),
+        ("a.csv", "t,position,speed\n0,1,2\n0.1,1,2\n", ("a.csv", "force")),
+        ("a.csv", "t,position,speed,force\n0,1,2,3\nlate,1,2,3\n", ("a.csv", 3, "late")),
+        ("a.csv", "t,position,speed,force\n,1,2,3\n0.1,1,2,3\n", ("a.csv", 2, "t")),
+        ("a.csv", "t,t,force\n", ("a.csv", "t")),
+        ("a.csv", "", ("a.csv",)),
+        ("a.csv", b"t,x\n\x81", ("a.csv", "charmap")),
+        ("a.csv", "t,position,speed,force\n0,1,2,3\n", ("a.csv",)),
+        ("a.npz", b"PK", ("a.npz",)),
+        ("a.mat", b"MATLAB", ("a.mat",)),
+        ("a.mcap", b"\x89MCAP0\r\n", ("a.mcap", "MCAP")),
+        ("a.parquet", b"PAR1", ("a.parquet", 4)),
+        ("a.db3", b"SQLite format 3", ("a.db3", "ROS", 2)),
+        ("a.rrd", b"", ("a.rrd", "files")),
     ],
 )
 def test_what_cannot_be_read_is_named_by_file_field_and_row(
-    name: str, content: str | bytes, message: str, tmp_path: Path
+    name: str, content: str | bytes, facts: tuple[object, ...], tmp_path: Path
 ) -> None:
-    with pytest.raises(InputError, match=message):
+    with refuses(InputError, *facts):
         read_recordings([broken(tmp_path, name, content)], TABLE)
 
 
@@ -224,13 +223,11 @@ def test_half_a_file_is_refused_or_read_in_part(name: str, tmp_path: Path) -> No
 def test_fields_of_messages_are_named_if_one_is_missing_or_is_no_number(tmp_path: Path) -> None:
     write_mcap_json(tmp_path / "a.mcap", run(4))
     path = [tmp_path / "a.mcap"]
-    with pytest.raises(InputError, match=r"no field '/speed'; it has /state\.cart\.position, /state\.cart\.speed\[0\]"):
+    with refuses(InputError, "/speed", "state.cart.position", "state.cart.speed[0]"):
         read_recordings(path, LogMapping.from_table({"states": ["/speed"]}))
-    with pytest.raises(InputError, match=r"message 0 of /state: cart\.angle must be a number or a list .* got nothing"):
+    with refuses(InputError, 0, "cart.angle"):
         read_recordings(path, LogMapping.from_table({"states": ["/state.cart.angle"]}))
-    with pytest.raises(
-        InputError, match=r"message 0 of /state: name must be a number or a list of numbers, got 'cart'"
-    ):
+    with refuses(InputError, 0, "cart"):
         read_recordings(path, LogMapping.from_table({"states": ["/state.name"]}))
 
 
@@ -244,17 +241,13 @@ def test_a_message_in_another_encoding_is_named(tmp_path: Path) -> None:
         topic = writer.register_channel("/state", "flatbuffer", schema)
         writer.add_message(topic, log_time=0, publish_time=0, data=b"")
         writer.finish()
-    with pytest.raises(
-        InputError, match="the messages of /state are in flatbuffer with a schema in flatbuffer; messages in"
-    ):
+    with refuses(InputError, "flatbuffer", "a.mcap"):
         read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": ["/state.x"]}))
 
 
 def test_components_that_a_vector_lacks_are_named(tmp_path: Path) -> None:
     write_lerobot(tmp_path / "set", [run(5)])
-    with pytest.raises(
-        InputError, match=r"observation\.state has 2 components, so there is no observation\.state\[2\]"
-    ):
+    with refuses(InputError, 2, "observation.state[2]"):
         read_recordings([tmp_path / "set"], LogMapping.from_table({"states": ["observation.state[2]"]}))
 
 
@@ -262,16 +255,16 @@ def test_components_that_a_vector_lacks_are_named(tmp_path: Path) -> None:
 def test_a_data_set_with_an_unusable_description_is_refused(content: str, tmp_path: Path) -> None:
     write_lerobot(tmp_path / "set", [run(5)])
     (tmp_path / "set" / "meta" / "info.json").write_text(content)
-    with pytest.raises(InputError, match=r"info\.json"):
+    with refuses(InputError, "info.json"):
         read_recordings([tmp_path / "set"])
 
 
 def test_no_log_at_all_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="there is no log"):
+    with refuses(InputError):
         read_logs([])
-    with pytest.raises(InputError, match=r"there is no file .*absent\.csv"):
+    with refuses(InputError, "absent.csv"):
         read_logs([tmp_path / "absent.csv"])
-    with pytest.raises(InputError, match=r"the folder .* has no log"):
+    with refuses(InputError, "files", 2):
         read_logs([tmp_path])
 
 
@@ -282,7 +275,7 @@ def test_logs_of_different_systems_are_not_read_as_one(tmp_path: Path) -> None:
     one = read_recordings([tmp_path / "other.npz"], mapping)
     assert isinstance(one, Recordings)
     np.savez(tmp_path / "third.npz", t=np.arange(3.0), x=np.zeros((3, 2)), u=np.zeros((2, 1)))
-    with pytest.raises(InputError, match=r"third\.npz has other states or inputs than .*other\.npz"):
+    with refuses(InputError, "third.npz", "other.npz"):
         read_recordings([tmp_path / "other.npz", tmp_path / "third.npz"], mapping)
 
 
@@ -292,7 +285,7 @@ def test_a_pickled_array_is_refused_and_its_code_does_not_run(tmp_path: Path) ->
             return (Path.touch, (tmp_path / "ran",))  # type: ignore[return-value]
 
     np.savez(tmp_path / "a.npz", t=np.arange(2.0), x=np.array([Hostile(), Hostile()], dtype=object))
-    with pytest.raises(InputError, match="its array x holds neither real numbers nor text"):
+    with refuses(InputError, "x", "a.npz"):
         read_recordings([tmp_path / "a.npz"])
     assert not (tmp_path / "ran").exists()
 
@@ -320,7 +313,7 @@ def test_a_missing_library_is_named_with_its_extra(tmp_path: Path) -> None:
         "except Exception as error: print(error)"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said.strip() == "Parquet files need pyarrow: pip install 'ctxval[logs]'."
+    assert_names(said.strip(), "ctxval[logs]")
 
 
 def test_the_stamps_in_messages_of_ros_1_are_times_too(tmp_path: Path) -> None:
@@ -335,7 +328,7 @@ def test_the_stamps_in_messages_of_ros_1_are_times_too(tmp_path: Path) -> None:
 def test_the_fields_of_ros_1_are_listed_if_one_is_missing(tmp_path: Path) -> None:
     write_bag1(tmp_path / "b.bag", run(4))
     wrong = LogMapping.from_table({"states": ["/joint.angle"]})
-    with pytest.raises(InputError, match=r"/joints.header.stamp.sec.*, /joints.position\[0\], /joints.velocity"):
+    with refuses(InputError, "joints.header.stamp.sec", "joints.position[0]", "joints.velocity"):
         read_recordings([tmp_path / "b.bag"], wrong)
 
 
@@ -345,13 +338,13 @@ def test_a_damaged_message_is_named(tmp_path: Path) -> None:
     length = b"\x04\x00\x00\x00cart\x01\x00\x00\x00"
     assert whole.count(length) == 5
     (tmp_path / "run.bag").write_bytes(whole.replace(length, length[:-4] + b"\xff\xff\xff\x7f", 1))
-    with pytest.raises(InputError, match=r"message 0, of /joints: it cannot be decoded \(ValueError: the message"):
+    with refuses(InputError, 0, "ValueError"):
         read_recordings([tmp_path / "run.bag"], JOINTS)
     (tmp_path / "cut.bag").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match=r"cut.bag cannot be read as a bag of ROS 1"):
+    with refuses(InputError, "cut.bag", "ROS", 1):
         read_recordings([tmp_path / "cut.bag"], JOINTS)
     (tmp_path / "text.bag").write_text("no bag")
-    with pytest.raises(InputError, match=r"text.bag cannot be read as a bag of ROS 1"):
+    with refuses(InputError, "text.bag", "ROS", 1):
         read_recordings([tmp_path / "text.bag"], JOINTS)
 
 
@@ -419,7 +412,7 @@ float64[] y
     numbers = {"a": True, "b": 3 - 6 * (version == 1), "c": 200, "d": -300, "e": 2**63, "f": 0.25, "g": "caf\u00e9"}
     assert plain == {**numbers, **times, "j": [1, 2, 3], "k": ["a", ""], "m": [1, 2]}
     for size in range(len(data)):
-        with pytest.raises(ValueError, match=r"shorter than its definition|longer than its message"):
+        with refuses(ValueError):
             decode(data[:size])
     if version == 2:
         large = bytes(store.serialize_cdr(message, "rig/msg/All", little_endian=False))
@@ -431,7 +424,7 @@ def test_a_definition_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     write_bag1(tmp_path / "a.bag", run(4))
     content = (tmp_path / "a.bag").read_bytes()
     (tmp_path / "a.bag").write_bytes(content.replace(b"float64[] position", b"float64[  position"))
-    with pytest.raises(InputError, match=r"a\.bag: the definition of the messages of /joints, .*, cannot be read"):
+    with refuses(InputError, "a.bag", "sensor_msgs/msg/JointState"):
         read_recordings([tmp_path / "a.bag"], JOINTS)
 
 
@@ -442,7 +435,7 @@ def test_header_stamps_are_the_times_if_they_are_plausible(tmp_path: Path) -> No
         write_mcap_ros2(tmp_path / name, one, late=late)
         found = read_recordings([tmp_path / name], JOINTS, longest_gap=1e9)
         clock = "their header stamps" if name[0] == "l" else "those at which they were logged"
-        assert f"the times of messages are {clock}" in found.notes
+        assert_names(found.notes, "times", clock)
     (log,) = read_logs([tmp_path / "late.mcap"])
     times = log.signals(["/joints.effort"], JOINTS.clock)["/joints.effort"].times
     np.testing.assert_allclose(times, one.times, atol=1e-9)

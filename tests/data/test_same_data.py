@@ -17,6 +17,7 @@ from ctxval import Experiment, Plan, Task, TaskSpace, Trajectory, Validation, co
 from ctxval.campaign.telling import SuppliedResult
 from ctxval.data import LogMapping
 from ctxval.errors import InputError
+from facts import refuses
 from rig_logs import write_bag, write_bag1
 
 FORMATS = ("comma", "semicolon", "tab", "npz", "mat5", "mat7.3", "parquet", "mcap", "bag", "bag1")
@@ -232,7 +233,7 @@ def test_the_same_recording_in_other_clothes_has_the_same_distance(
     path, mapping, refused = written(tmp_path_factory.mktemp("same"), worn)
     made, plan = experiment()
     if refused:
-        with pytest.raises(InputError, match=r"two columns|several columns|twice|must have \d+ cells"):
+        with refuses(InputError):
             read(path, mapping)
         return
     found = made.validation.accept(plan, read(path, mapping))

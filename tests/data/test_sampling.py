@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from ctxval.data import Field, LogMapping, MemoryTable, Recordings, read_recordings, recordings_of
 from ctxval.errors import InputError
+from facts import assert_names, refuses
 from rig_logs import run, write_mcap_json
 
 
@@ -27,7 +28,7 @@ def test_states_are_interpolated_and_inputs_are_averaged_over_each_step() -> Non
     np.testing.assert_allclose(one.states[:, 0], np.interp(one.times, times, times**2), atol=1e-12)
     fine = one.times[:-1, None] + 0.04 * (np.arange(1000) + 0.5) / 1000
     np.testing.assert_allclose(one.inputs[:, 0], (np.floor(fine / 0.1) / 10).mean(axis=1), atol=1e-4)
-    assert any("less often than every step of 0.04 s: its values between two samples" in note for note in found.notes)
+    assert_names(found.notes, 0.04)
 
 
 @given(
@@ -53,7 +54,7 @@ def test_the_input_acts_after_its_delay() -> None:
         found = recorded({"t": times, "x": 10 * times, "u": 10 * times}, delay=delay)
         one = found.runs[0].trajectory
         np.testing.assert_allclose(one.inputs[:, 0], one.states[:-1, 0] - 10 * delay, atol=1e-9)
-        assert f"inputs act {delay:g} s after they are logged" in found.notes
+        assert_names(found.notes, f"{delay:g}")
 
 
 @pytest.mark.parametrize("missing", [[5], [5, 6], [5, 9], [0, 1], [10]])
@@ -76,7 +77,7 @@ def test_a_gap_between_samples_splits_the_recording_and_is_stated() -> None:
     gap = found.breaks[0]
     assert (gap.field, gap.time) == ("x", 0.4)
     assert gap.seconds == pytest.approx(0.4)
-    assert str(gap) == "log, 0.4 s: x has no sample for 0.4 s"
+    assert_names(str(gap), 0.4, "x")
     bridged = recorded({"t": times, "x": times, "u": times}, longest_gap=0.5)
     assert ([one.trajectory.horizon for one in bridged.runs], bridged.breaks) == ([11], ())
 
@@ -86,26 +87,26 @@ def test_lost_messages_split_a_recording(tmp_path: Path) -> None:
     mapping = LogMapping.from_table({"states": ["/state.cart.position"], "inputs": ["/command.force"]})
     found = read_recordings([tmp_path / "a.mcap"], mapping)
     assert [one.trajectory.horizon for one in found.runs] == [19, 17, 19]
-    assert [one.reason for one in found.breaks] == ["has no sample for 0.15 s", "has no sample for 0.1 s"]
+    assert_names([one.reason for one in found.breaks], 0.15, 0.1)
 
 
 def test_times_that_go_back_begin_another_recording() -> None:
     times = [0.0, 0.1, 0.2, 0.0, 0.1, 0.2, 0.3]
     found = recorded({"t": times, "x": np.arange(7), "u": np.arange(7)})
     assert [one.trajectory.states[:, 0].tolist() for one in found.runs] == [[0, 1, 2], [3, 4, 5, 6]]
-    assert "go back from 0.2 s to 0 s at row 3" in found.breaks[0].reason
+    assert_names(found.breaks[0].reason, 0.2, 0, 3)
 
 
 def test_times_that_do_not_tell_rows_apart_are_refused() -> None:
     single = (1.7e9 + np.arange(0, 3, 0.05)).astype(np.float32)
     for dt, times in ((0.05, single), (0.1, np.round(np.arange(0, 3, 0.05), 1))):
         values = np.arange(60.0)
-        with pytest.raises(InputError, match=r"of 60 rows have the time of the row before.*more digits"):
+        with refuses(InputError, 60, 1):
             recorded({"t": times, "x": values, "u": values}, dt=dt)
     twice = np.insert(np.arange(0, 3, 0.05), 3, 0.1)
     repeated = recorded({"t": twice, "x": np.arange(61.0), "u": np.arange(61.0)})
     assert len(repeated.runs) == 2
-    assert "stay at 0.1 s at row 3" in repeated.breaks[0].reason
+    assert_names(repeated.breaks[0].reason, 0.1, 3)
 
 
 def test_a_held_command_is_no_gap() -> None:
@@ -146,14 +147,12 @@ def test_topics_with_times_that_go_back_are_refused() -> None:
 
     first = Channel("x", "", False, np.arange(3.0), np.arange(3.0))
     second = Channel("u", "", True, np.array([0.0, 2.0, 1.0]), np.arange(3.0), path="/u", place=("message", 0))
-    with pytest.raises(
-        InputError, match=r"message 2 of /u: its time must be after that of the one before, 2 s, got 1 s"
-    ):
+    with refuses(InputError, 2, "time", 1):
         sampled("log", [first, second], 1.0, 0.0, None)
 
 
 def test_too_many_steps_are_refused() -> None:
-    with pytest.raises(InputError, match=r"more than 20000000: give a larger dt"):
+    with refuses(InputError, 20000000, "dt"):
         recorded({"t": [0.0, 1.0], "x": [0.0, 1.0], "u": [0.0, 0.0]}, dt=1e-9, longest_gap=1.0)
 
 
@@ -220,10 +219,10 @@ def test_one_file_in_another_unit_is_converted_or_refused(tmp_path: Path) -> Non
     assert found.states == {"angle": "rad"}
     for number, one in enumerate(found.runs):
         np.testing.assert_allclose(one.trajectory.states[:, 0], 0.01 * (np.arange(5) + number))
-    with pytest.raises(InputError, match=r"1\.csv has angle in deg, and other logs have it in an unknown unit"):
+    with refuses(InputError, "1.csv", "angle"):
         read_recordings(written("angle", "angle [deg]"), mapping)
-    for header, message in (("angle [m]", "no known factor from m to rad"), ("angle [gon]", "factor from gon to rad")):
-        with pytest.raises(InputError, match=message):
+    for header, fact in (("angle [m]", "rad"), ("angle [gon]", "rad")):
+        with refuses(InputError, fact):
             read_recordings(written("angle [rad]", header), mapping)
     in_degrees = read_recordings(written("angle [deg]"), mapping, states={"angle": "rad"})
     np.testing.assert_allclose(in_degrees.runs[0].trajectory.states[:, 0], 0.01 * np.arange(5))
@@ -231,19 +230,16 @@ def test_one_file_in_another_unit_is_converted_or_refused(tmp_path: Path) -> Non
 
 def test_times_in_another_unit_than_seconds_are_never_interpolated() -> None:
     times = 20.0 * np.arange(1500)
-    with pytest.raises(
-        InputError,
-        match=r"every 20 s, and a step takes 0.02 s: if the times are in ms, convert them to s, name their col",
-    ):
+    with refuses(InputError, 20, 0.02):
         recorded({"t": times, "x": times, "u": times}, dt=0.02)
-    with pytest.raises(InputError, match=r"every 0.1 s, and a step takes 0.02 s: give dt = 0.1, or longest_gap if"):
+    with refuses(InputError, 0.1, 0.02, "dt"):
         recorded({"t": times / 200, "x": times, "u": times}, dt=0.02)
     for name, unit, factor in (("t [ms]", "", 1), ("time_us", "", 1e3), ("timestamp", "", 1e6), ("t", "ms", 1)):
         start = 1.7e18 if name == "timestamp" else 0.0
         found = recorded({name: start + factor * times, "x": times, "u": times}, dt=0.02, time_unit=unit)
         assert [one.trajectory.horizon for one in found.runs] == [1499]
         np.testing.assert_allclose(found.runs[0].trajectory.states[:, 0], times)
-    with pytest.raises(InputError, match="log has its times in ms, and time_unit states s"):
+    with refuses(InputError, "time_unit", "s"):
         recorded({"t [ms]": times, "x": times, "u": times}, time_unit="s")
 
 
@@ -260,7 +256,7 @@ def test_marks_of_missing_values_split_a_recording_and_are_stated() -> None:
     x[[7, 8]] = -999
     found = recorded({"t": times, "x": x, "u": times})
     assert [one.trajectory.horizon for one in found.runs] == [6, 10]
-    assert "log: x is -999 in 2 rows, far from all other values: it is taken as missing" in found.notes
+    assert_names(found.notes, "x", -999, 2)
 
 
 def test_a_mark_may_have_been_converted_with_its_column() -> None:
@@ -269,12 +265,12 @@ def test_a_mark_may_have_been_converted_with_its_column() -> None:
     log = MemoryTable("log", {"t": times, "x [km/h]": x, "u": times})
     found = recordings_of([log], LogMapping({"x": Field("x", "m/s")}, {"u": Field("u")}))
     assert [one.trajectory.horizon for one in found.runs] == [6, 11]
-    assert "log: x is -3596.4 in 1 row, far from all other values: it is taken as missing" in found.notes
+    assert_names(found.notes, "log", "x", -3596.4, 1)
 
 
 def test_values_whose_squares_are_not_finite_are_refused() -> None:
     times = np.arange(20) / 10
-    with pytest.raises(InputError, match=r"log: x must be at most 1e\+100, got 1e\+300; leave out missing values"):
+    with refuses(InputError, "x", 100, 300):
         recorded({"t": times, "x": np.full(20, -1e300), "u": times})
     mark = np.where(np.arange(20) == 7, 1e300, times)
     assert len(recorded({"t": times, "x": mark, "u": times}).runs) == 2
@@ -286,9 +282,9 @@ def test_only_valid_rows_count() -> None:
     for valid in ("status == 0", "status != 1", "status==0.0"):
         found = recorded({"t": times, "x": times, "u": times, "status": status}, valid=valid)
         assert [one.trajectory.horizon for one in found.runs] == [3, 4]
-    with pytest.raises(InputError, match="valid must be a field and a number, such as 'status == 0', got 'status'"):
+    with refuses(InputError, "valid", "status", 0):
         recorded({"t": times, "x": times, "u": times}, valid="status")
-    with pytest.raises(InputError, match="log has no field 'state'"):
+    with refuses(InputError, "state", "x"):
         recorded({"t": times, "x": times, "u": times}, valid="state == 0")
 
 

@@ -27,6 +27,7 @@ from ctxval.distances import (
     WholeTrajectory,
 )
 from ctxval.errors import InputError, ShapeError, UnknownNameError
+from facts import refuses
 
 HORIZON, N = 4, 3
 NORMS = [1, 2, np.inf]
@@ -184,7 +185,7 @@ def test_the_goal_error_depends_on_the_system_alone() -> None:
 @pytest.mark.parametrize("cls", [FinalState, WholeTrajectory, MeanDeviation, MaximumDeviation, GoalError])
 @pytest.mark.parametrize("order", [0, 3, np.nan])
 def test_another_norm_is_refused_by_value(cls: type, order: float) -> None:
-    with pytest.raises(InputError, match=rf"norm must be 1, 2 or inf, got {order}"):
+    with refuses(InputError, "norm", 1, order):
         cls(norm=order)
 
 
@@ -262,7 +263,7 @@ def test_the_distance_at_times_takes_the_nearest_steps() -> None:
     M, S = pair()
     d = AtTimes(2, times=[0.1, 0.29])(trajectory(M), trajectory(S), task())
     assert d == pytest.approx(max(norm(S[t] - M[t], 2) for t in (1, 3)), rel=1e-14)
-    with pytest.raises(InputError, match=r"times must not be after the end of the task at 0.4 s, got 0.5 s"):
+    with refuses(InputError, "times", 0.4, 0.5):
         AtTimes(times=[0.1, 0.5])(trajectory(M), trajectory(S), task())
 
 
@@ -322,46 +323,48 @@ def test_the_relative_deviation_divides_by_the_motion_of_the_model() -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "error", "message"),
+    ("make", "error", "facts"),
     [
-        (lambda: FinalState(weights=[1, -1]), InputError, r"weights must be numbers >= 0, not all of them 0, got"),
-        (lambda: FinalState(weights=[0, 0]), InputError, r"weights must be numbers >= 0"),
-        (lambda: FinalState(scales=[1, 0]), InputError, r"scales must be positive numbers, got \[1, 0\]"),
-        (lambda: FinalState(scales=[np.nan]), InputError, "scales must be a list of which each item is a number"),
-        (lambda: FinalState(scales=2.0), InputError, "scales must be a list, got 2.0"),
-        (lambda: FinalState(2, (0, 1), weights=[1]), ShapeError, "one number for each of 2 states"),
+        (lambda: FinalState(weights=[1, -1]), InputError, ("weights", 0)),
+        (lambda: FinalState(weights=[0, 0]), InputError, ("weights", 0)),
+        (lambda: FinalState(scales=[1, 0]), InputError, ("scales", [1, 0])),
+        (lambda: FinalState(scales=[np.nan]), InputError, ("scales",)),
+        (lambda: FinalState(scales=2.0), InputError, ("scales", 2.0)),
+        (lambda: FinalState(2, (0, 1), weights=[1]), ShapeError, (2, "weights")),
         (
             lambda: FinalState(angles=[0.5]),
             InputError,
-            r"is an integer or a text, got \[0.5\]",
+            ([0.5], "angles"),
         ),
-        (lambda: AtTimes(), ShapeError, "times must be a list"),
-        (lambda: RelativeDeviation(), ShapeError, "least must be a list"),
-        (lambda: FinalState(components=[]), InputError, "components must name at least one state; leave it out"),
-        (lambda: AtCrossing(crossings=0), InputError, "crossings must be a positive integer, got 0"),
-        (lambda: AtCrossing(level=np.inf), InputError, "level must be a finite number, got inf"),
-        (lambda: CrossingTime(direction="upp"), UnknownNameError, "did you mean 'up'"),
+        (lambda: AtTimes(), ShapeError, ("times", ())),
+        (lambda: RelativeDeviation(), ShapeError, ("least", ())),
+        (lambda: FinalState(components=[]), InputError, ("components",)),
+        (lambda: AtCrossing(crossings=0), InputError, ("crossings", 0)),
+        (lambda: AtCrossing(level=np.inf), InputError, ("level",)),
+        (lambda: CrossingTime(direction="upp"), UnknownNameError, ("up", "direction")),
     ],
 )
 def test_arguments_that_cannot_be_used_are_refused(
-    make: Callable[[], object], error: type[Exception], message: str
+    make: Callable[[], object], error: type[Exception], facts: tuple[object, ...]
 ) -> None:
-    with pytest.raises(error, match=message):
+    with refuses(error, *facts):
         make()
 
 
 @pytest.mark.parametrize(
-    ("distance", "message"),
+    ("distance", "facts"),
     [
-        (FinalState(weights=[1, 2]), "there must be a weight or a scale for each of 3 states, got 2"),
-        (FinalState(angles=[3]), "angles must be indices of 3 states, from 0 to 2, got 3"),
-        (FinalState(components=[-4]), "components must be indices of 3 states, from 0 to 2, got -4"),
-        (CrossingTime(state=5), "state must be indices of 3 states"),
+        (FinalState(weights=[1, 2]), (3, 2)),
+        (FinalState(angles=[3]), ("angles", 3, 0)),
+        (FinalState(components=[-4]), ("components", 3, 0)),
+        (CrossingTime(state=5), ("state", 3)),
     ],
 )
-def test_indices_and_numbers_that_do_not_fit_the_states_are_refused(distance: Distance, message: str) -> None:
+def test_indices_and_numbers_that_do_not_fit_the_states_are_refused(
+    distance: Distance, facts: tuple[object, ...]
+) -> None:
     M, S = (trajectory(states) for states in pair())
-    with pytest.raises(ShapeError, match=message):
+    with refuses(ShapeError, *facts):
         distance(M, S, task())
 
 
@@ -398,5 +401,5 @@ def test_a_tracking_error_is_that_between_s_and_its_reference() -> None:
     assert TrackingError()(elsewhere, system, along) == 3.0
     assert TrackingError(1, over="mean")(elsewhere, system, along) == 1.0
     assert TrackingError(2, (1,), scales=[0.5])(elsewhere, system, along) == 6.0
-    with pytest.raises(UnknownNameError, match="did you mean 'maximum'"):
+    with refuses(UnknownNameError, "maximum", "over"):
         TrackingError(over="maximun")  # type: ignore[arg-type]

@@ -6,6 +6,7 @@ import pytest
 from ctxval._util.arrays import Array
 from ctxval.errors import InputError
 from ctxval.gp.cholesky import factorise
+from facts import refuses
 
 
 def covariance(n: int = 7) -> Array:
@@ -40,7 +41,7 @@ def test_the_covariance_is_not_changed() -> None:
 
 def test_to_insist_is_to_raise_the_noise_tenfold_until_it_suffices() -> None:
     K = np.array([[1.0, 1.2], [1.2, 1.0]])
-    with pytest.raises(InputError, match=r"covariance of 2 observations .* raise the noise"):
+    with refuses(InputError, 2):
         factorise(K, 0.005)
     np.testing.assert_allclose(factorise(K, 0.005, insist=True).L, factorise(K, 0.5).L, rtol=1e-14)
 
@@ -48,5 +49,5 @@ def test_to_insist_is_to_raise_the_noise_tenfold_until_it_suffices() -> None:
 def test_a_covariance_that_is_no_number_is_not_positive_definite() -> None:
     K = covariance()
     K[3, 3] = np.nan
-    with pytest.raises(InputError, match="not positive definite"):
+    with refuses(InputError, 7):
         factorise(K, 1e-6, insist=True)

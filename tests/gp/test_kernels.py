@@ -8,6 +8,7 @@ from sklearn.gaussian_process import kernels as oracle
 
 from ctxval.errors import InputError
 from ctxval.gp.kernels import Matern
+from facts import refuses
 
 D = 3
 KERNELS: dict[str, Matern] = {
@@ -145,5 +146,5 @@ def test_equal_length_scales_are_the_isotropic_kernel(name: str) -> None:
 
 @pytest.mark.parametrize("nu", [0.5, 2, 3.5, np.inf])
 def test_another_smoothness_is_refused_by_value(nu: float) -> None:
-    with pytest.raises(InputError, match=rf"must be 1\.5, 2\.5 or 4\.5, got {nu}"):
+    with refuses(InputError, 1.5, 2.5, nu):
         Matern(nu)

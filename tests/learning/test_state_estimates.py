@@ -84,7 +84,6 @@ def test_a_campaign_decides_with_the_angle_alone(share: float, answer: str) -> N
     assert verdict.answer == answer
     if answer == "validated":
         assert largest <= verdict.bound <= share * largest
-        assert "(estimated from outputs)" in str(verdict)
 
 
 class Fragile:

@@ -7,6 +7,7 @@ from ctxval._util.arrays import Array
 from ctxval.errors import InputError, ModelError
 from ctxval.models import Expected, Linear
 from ctxval.testing import check_model
+from facts import refuses
 
 
 def square(x: Array, u: Array, w: Array) -> Array:
@@ -37,8 +38,8 @@ def test_the_draws_follow_from_the_seed_and_are_even() -> None:
 
 
 def test_bad_input_is_named() -> None:
-    with pytest.raises(InputError, match="noise"):
+    with refuses(InputError, "noise", 0):
         Expected(square, noise=0)
     wrong = Expected(lambda x, u, w: x[..., 0], noise=1)
-    with pytest.raises(ModelError, match=r"must return next states of shape \(64, 2\), got \(64,\)"):
+    with refuses(ModelError, (64, 2), (64,)):
         wrong.step(np.zeros(2), np.zeros(1))

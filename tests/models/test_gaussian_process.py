@@ -10,6 +10,7 @@ import pytest
 from ctxval import Task, Transitions, controllers, models, testing
 from ctxval.errors import InputError, ShapeError
 from ctxval.models import increments
+from facts import refuses
 
 LENGTH_SCALES = np.array([1.2, 3.0, 2.0])
 
@@ -144,14 +145,14 @@ def controllers_rollout(
 def test_what_cannot_be_used_is_refused() -> None:
     data = oscillator_data(30)
     own = conditioned()
-    with pytest.raises(InputError, match="finite transitions"):
+    with refuses(InputError, "model"):
         models.GaussianProcessModel.fit(Transitions(data.x, data.u, data.x_next * np.inf))
-    with pytest.raises(InputError, match="points must be a positive integer, got 0"):
+    with refuses(InputError, "points", 0):
         models.GaussianProcessModel.fit(data, 0)
     Z = np.zeros((3, 3))
-    with pytest.raises(InputError, match="not positive definite; raise the noise"):
+    with refuses(InputError, 3):
         models.GaussianProcessModel.conditioned(own.covariance, 0.0, Z, np.zeros((3, 2)), own.scaling)
-    with pytest.raises(ShapeError, match=r"2 states needs centres \(M, 3\), weights \(M, 2\)"):
+    with refuses(ShapeError, 2, "states"):
         models.GaussianProcessModel(own.covariance, own.centres[:, :2], own.weights, own.scaling)
-    with pytest.raises(InputError, match="weights must be finite"):
+    with refuses(InputError, "weights"):
         models.GaussianProcessModel(own.covariance, own.centres, own.weights * np.nan, own.scaling)

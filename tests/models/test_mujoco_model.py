@@ -20,8 +20,9 @@ from ctxval.core.model import predicted_steps, with_memory
 from ctxval.core.trajectory import Transitions
 from ctxval.data import recordings_of
 from ctxval.data.log import MemoryTable
-from ctxval.errors import ExecutionError, InputError, ModelError, ShapeError
+from ctxval.errors import ExecutionError, InputError, ModelError, ShapeError, UnknownNameError
 from ctxval.studies.fitting import fit
+from facts import refuses
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -119,22 +120,22 @@ def test_it_is_the_model_of_a_campaign_and_repeats_itself_in_a_store(tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("given", "options", "said"),
+    ("given", "options", "facts"),
     [
-        ("<mujoco>", {}, "MuJoCo cannot compile the model"),
-        (mjcf(0.1), {"dt": 0.0125}, "dt must be a multiple of the model's timestep, 0.005 s, got 0.0125 s"),
-        (mjcf(0.1), {"dt": -1}, "dt must be a positive number"),
-        ("missing.xml", {}, "missing.xml"),
-        (mjcf(0.1), {"sites": "tip"}, "site"),
+        ("<mujoco>", {}, ("MuJoCo", "XML_ERROR_MISMATCHED_ELEMENT")),
+        (mjcf(0.1), {"dt": 0.0125}, ("dt", 0.005, 0.0125)),
+        (mjcf(0.1), {"dt": -1}, ("dt", -1)),
+        (("missing.xml",), {}, ("missing.xml",)),
+        (mjcf(0.1), {"sites": "tip"}, ("site", "tip")),
     ],
 )
-def test_what_cannot_be_a_model_is_refused(given: str, options: dict[str, Any], said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_what_cannot_be_a_model_is_refused(given: str, options: dict[str, Any], facts: tuple[object, ...]) -> None:
+    with refuses((InputError, UnknownNameError), *facts):
         models.MuJoCo(given, **options)
 
 
 def test_states_and_inputs_have_the_numbers_of_the_model() -> None:
-    with pytest.raises(ShapeError, match="1 qpos, 1 qvel and 1 inputs, got 3 states and 1 inputs"):
+    with refuses(ShapeError, 1, 3):
         models.MuJoCo(mjcf(0.1)).step(np.zeros(3), np.zeros(1))
 
 
@@ -220,7 +221,7 @@ def test_an_instability_of_both_is_agreement_and_of_one_a_counterexample(
     assert both.outcome([0.15]).distance == 0.0
     assert both.plan([0.15]).model_trajectory.horizon < 30
     assert both.distances([[0.1], [0.2]]).tolist() == [0.0, 0.0]
-    with pytest.raises(ExecutionError, match=r"^terminated: MuJoCo warned of BADQACC at step \d+$"):
+    with refuses(ExecutionError, "MuJoCo", "BADQACC"):
         Validation(model=models.MuJoCo(mjcf(0.0)), **parts).outcome([0.15])
 
 
@@ -265,18 +266,18 @@ def test_the_result_of_mujoco_sysid_is_a_model_with_its_held_out_error(tmp_path:
 def test_a_given_model_with_another_time_step_or_size_is_refused() -> None:
     one = recorded()
     log = MemoryTable("a", {"t": one.times, "x": one.states, "u": np.append(one.inputs, [[np.nan]], axis=0)})
-    with pytest.raises(InputError, match=r"steps of 0.005 s and the recording has steps of 0.02 s"):
+    with refuses(InputError, 0.005, 0.02):
         fit(recordings_of([log]), ["linear"], given=models.MuJoCo(mjcf(0.1)))
     larger = mjcf(0.1).replace("<body>", '<body><joint type="slide"/>')
-    with pytest.raises(ModelError, match=r"have 2 states and 1 inputs: the model has 2 qpos, 2 qvel and 1 inputs"):
+    with refuses(ModelError, 2, 1):
         fit(recordings_of([log]), ["linear"], given=models.MuJoCo(larger, dt=DT))
 
 
 def test_a_folder_must_have_one_identified_model(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"has no result of mujoco.sysid: params_x_hat.yaml and an XML file"):
+    with refuses(InputError, "mujoco.sysid", "params_x_hat.yaml"):
         models.MuJoCo(tmp_path)
     (tmp_path / "params_x_hat.yaml").write_text("{}")
     for name in ("a.xml", "b.xml"):
         (tmp_path / name).write_text(mjcf(0.1))
-    with pytest.raises(InputError, match=r"several identified models, a.xml, b.xml: name one of the files"):
+    with refuses(InputError, "a.xml", "b.xml"):
         models.MuJoCo(tmp_path)

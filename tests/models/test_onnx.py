@@ -18,6 +18,7 @@ from ctxval.core.model import linearize
 from ctxval.core.rollout import rollout
 from ctxval.errors import InputError, ModelError, ShapeError
 from ctxval.models import Onnx
+from facts import refuses
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -136,11 +137,11 @@ def test_weights_may_stand_in_a_second_file(tmp_path: Path) -> None:
 
 def test_shapes_must_fit() -> None:
     model = Onnx(network())
-    with pytest.raises(ShapeError, match="input 'xu' takes 3 numbers, got 4"):
+    with refuses(ShapeError, "xu", 3, 4):
         model.step(np.zeros(2), np.zeros(2))
-    with pytest.raises(ShapeError, match="must return as many states as it takes, 1, got 2"):
+    with refuses(ShapeError, 1, 2):
         model.step(np.zeros(1), np.zeros(2))
-    with pytest.raises(ShapeError, match="input 'u' takes 1 numbers, got 2"):
+    with refuses(ShapeError, "u", 1, 2):
         Onnx(network(two_inputs=True)).step(np.zeros(2), np.zeros(2))
 
 
@@ -149,23 +150,23 @@ def test_an_open_width_is_checked_when_it_is_used() -> None:
     content.graph.input[0].type.tensor_type.shape.dim[1].dim_param = "k"
     model = Onnx(content.SerializeToString())
     np.testing.assert_allclose(model.step(np.ones(2), np.ones(1)), expected(np.ones(2), np.ones(1)), atol=1e-12)
-    with pytest.raises(ModelError, match="the network cannot be evaluated"):
+    with refuses(ModelError, 1, 59):
         model.step(np.zeros(2), np.zeros(2))
 
 
 def test_other_networks_and_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="any number of rows or one row, got 4 rows"):
+    with refuses(InputError, "rows", 4):
         Onnx(network(rows=4))
-    with pytest.raises(InputError, match="cannot be read as an ONNX network"):
+    with refuses(InputError, "INVALID_PROTOBUF", 7):
         Onnx(b"junk")
-    with pytest.raises(InputError, match=r"none\.onnx cannot be read: No such file"):
+    with refuses(InputError, "none.onnx"):
         Onnx(tmp_path / "none.onnx")
     os.mkfifo(tmp_path / "fifo.onnx")
-    with pytest.raises(InputError, match=r"fifo\.onnx cannot be read: it is a FIFO and not a regular file"):
+    with refuses(InputError, "fifo.onnx", "FIFO"):
         Onnx(tmp_path / "fifo.onnx")
     content = onnx.load_from_string(network(two_inputs=True))
     content.graph.input.append(helper.make_tensor_value_info("extra", DOUBLE, ["N", 1]))
-    with pytest.raises(InputError, match="as one or two inputs, but the network has x, u, extra"):
+    with refuses(InputError, "extra", "model"):
         Onnx(content.SerializeToString())
     whole = helper.make_graph(
         [helper.make_node("Identity", ["i"], ["y"])],
@@ -174,11 +175,11 @@ def test_other_networks_and_files_are_refused(tmp_path: Path) -> None:
         [helper.make_tensor_value_info("y", TensorProto.INT64, ["N", 3])],
     )
     model = helper.make_model(whole, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    with pytest.raises(InputError, match=r"'i' must be real numbers \(N, k\) or \(k,\), got tensor\(int64\)"):
+    with refuses(InputError, "i", "N"):
         Onnx(model.SerializeToString())
 
 
 def test_without_onnxruntime_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(InputError, match=r"pip install 'ctxval\[onnx\]'"):
+    with refuses(InputError, "ctxval[onnx]"):
         Onnx(network())

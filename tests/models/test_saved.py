@@ -12,6 +12,7 @@ import pytest
 from ctxval import Transitions, models
 from ctxval.cli.config.parts import part
 from ctxval.errors import InputError
+from facts import refuses
 
 RNG = np.random.default_rng(0)
 X, U = RNG.normal(size=(60, 2)), RNG.normal(size=(60, 1))
@@ -52,32 +53,32 @@ def test_two_matrices_are_a_linear_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("content", "facts"),
     [
-        ({}, "it has no array A"),
-        ({"A": [[1.0, 2.0]], "B": [[1.0]]}, r"needs A \(n, n\), B \(n, m\)"),
-        ({"A": [[1.0]], "B": [[np.nan]]}, "B must be finite"),
-        ({"about": "{}"}, "its format must be 'ctxval model' of version 1"),
-        ({"about": "[]"}, "its format must be 'ctxval model' of version 1"),
-        ({"about": "no json"}, "cannot be read as a model"),
-        ({"about": {"kind": "Pickle"}}, "its kind must be one of Linear, FeedforwardReLU, .* got 'Pickle'"),
-        ({"about": {"kind": "FeedforwardReLU"}}, "it has no array shift_in"),
-        ({"about": {"kind": "GaussianProcessModel"}, "shift_in": [1.0]}, "it has no array scale_in"),
-        ({"A": np.array([{}])}, "neither real numbers nor text"),
+        ({}, ("A", "model.npz")),
+        ({"A": [[1.0, 2.0]], "B": [[1.0]]}, ("A", "B")),
+        ({"A": [[1.0]], "B": [[np.nan]]}, ("B", "model.npz")),
+        ({"about": "{}"}, ("format", "ctxval model", 1)),
+        ({"about": "[]"}, ("format", "ctxval model", 1)),
+        ({"about": "no json"}, ("model.npz", 1)),
+        ({"about": {"kind": "Pickle"}}, ("kind", "FeedforwardReLU", "Pickle")),
+        ({"about": {"kind": "FeedforwardReLU"}}, ("shift_in", "model.npz")),
+        ({"about": {"kind": "GaussianProcessModel"}, "shift_in": [1.0]}, ("scale_in", "model.npz")),
+        ({"A": np.array([{}])}, ("model.npz",)),
     ],
 )
-def test_a_file_that_is_no_model_is_refused(content: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_a_file_that_is_no_model_is_refused(content: dict[str, Any], facts: tuple[object, ...], tmp_path: Path) -> None:
     if isinstance(content.get("about"), dict):
         content = content | {"about": json.dumps({"format": "ctxval model", "version": 1} | content["about"])}
     np.savez(tmp_path / "model.npz", **content)
-    with pytest.raises(InputError, match=message):
+    with refuses(InputError, *facts):
         models.read_model(tmp_path / "model.npz")
 
 
 def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="networks, Gaussian processes and corrections can be written"):
+    with refuses(InputError, "Function"):
         models.write_model(tmp_path / "a.npz", models.Function(lambda x, u: x))  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="cannot be written: No such file or directory"):
+    with refuses(InputError, "a.npz"):
         models.write_model(tmp_path / "absent" / "a.npz", SAVED[0])
-    with pytest.raises(InputError, match="there are no recorded steps to write"):
+    with refuses(InputError, "a.npz"):
         models.write_transitions(tmp_path / "a.npz", None)

@@ -14,6 +14,7 @@ from ctxval.core.model import linearize
 from ctxval.core.rollout import rollout
 from ctxval.errors import InputError, ModelError, ShapeError
 from ctxval.models import Torch
+from facts import refuses
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'ctxval[torch]'")
 
@@ -85,9 +86,9 @@ def test_identity_and_copies() -> None:
 
 
 def test_refused() -> None:
-    with pytest.raises(InputError, match="one or two tensors"):
+    with refuses(InputError):
         Torch(lambda x, u, t: x)
-    with pytest.raises(ShapeError, match="a next state for each state"):
+    with refuses(ShapeError):
         Torch(lambda x, u: u).step(np.ones((3, 2)), np.ones((3, 1)))
-    with pytest.raises(ModelError, match="cannot be evaluated"):
+    with refuses(ModelError):
         Torch(network()).step(np.ones(4), np.ones(1))

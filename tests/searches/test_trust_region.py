@@ -13,6 +13,7 @@ from ctxval._util.describe import describe
 from ctxval.errors import InputError
 from ctxval.searches import Auto, BayesianOptimisation, Prediction, Random, TrustRegion
 from ctxval.searches.base import Note, Pending
+from facts import refuses
 
 Function = Callable[[Array], Array]
 
@@ -70,7 +71,6 @@ def test_a_wrong_prediction_does_not_keep_the_top_hidden() -> None:
     assert run(search, hill, lambda X: 1.0 - 0.9 * hill(X), 25).max() > 0.97
     fallen = [note for note in search.notes if note is not None and note["engine"] == "scalar"]
     assert fallen
-    assert "leaving one out, the prediction errs by" in fallen[0]["why"]
 
 
 def engines(search: TrustRegion) -> list[str]:
@@ -85,8 +85,6 @@ def test_if_doubtful_predictions_were_far_off_every_second_point_is_that_of_the_
     search = TrustRegion()
     run(search, hill, lambda X: 220.0 * X[:, 0] ** 4, 6, doubt=doubtful)
     assert engines(search) == ["climb", "climb", "scalar", "climb", "scalar", "climb"]
-    hedges = [note["why"] for note in search.notes if note is not None and note["engine"] == "scalar"]
-    assert all("the last two predictions erred by" in why and "is in doubt" in why for why in hedges)
     never = varied(hedge=False)
     run(never, hill, lambda X: 220.0 * X[:, 0] ** 4, 5, doubt=doubtful)
     assert engines(never) == ["climb"] * 5
@@ -106,9 +104,8 @@ def test_predictions_that_find_nothing_larger_are_hedged_though_they_are_right()
         return np.exp(-4 * ((X - 0.2) ** 2).sum(axis=1))
 
     values = run(search, lambda X: plain(X) + 3 * (X > 0.75).all(axis=1), plain, 30)
-    hedges = [note["why"] for note in search.notes if note is not None and note["engine"] == "scalar"]
     assert engines(search)[:6] == ["climb"] * 6
-    assert all("found nothing larger" in why for why in hedges)
+    assert "scalar" in engines(search)
     assert values.max() > 3
 
 
@@ -117,7 +114,9 @@ def test_without_a_prediction_the_scalar_search_goes_on_and_says_so() -> None:
     search.reset(2, 5)
     random.reset(2, 5)
     np.testing.assert_array_equal(search.ask(1), random.ask(1))
-    assert search.note() == {"engine": "scalar", "how": "initial", "why": "there is no prediction"}
+    note = search.note()
+    assert note is not None
+    assert (note["engine"], note["how"]) == ("scalar", "initial")
 
 
 def test_a_prediction_of_nothing_is_none() -> None:
@@ -125,7 +124,9 @@ def test_a_prediction_of_nothing_is_none() -> None:
     search.reset(2, 0)
     search.use_prediction(predicting(lambda X: np.full(len(X), np.nan)))
     assert np.isfinite(search.ask(1)).all()
-    assert search.note() == {"engine": "scalar", "how": "initial", "why": "nothing is predicted anywhere"}
+    note = search.note()
+    assert note is not None
+    assert (note["engine"], note["how"]) == ("scalar", "initial")
 
 
 def test_doubt_draws_the_search_to_what_was_not_seen() -> None:
@@ -223,15 +224,17 @@ def test_a_reset_forgets_the_prediction() -> None:
     run(search, hill, hill, 2)
     search.reset(2, 0)
     search.ask(1)
-    assert search.note() == {"engine": "scalar", "how": "initial", "why": "there is no prediction"}
+    note = search.note()
+    assert note is not None
+    assert (note["engine"], note["how"]) == ("scalar", "initial")
 
 
 @pytest.mark.parametrize(
-    ("options", "sentence"),
-    [({"optimism": -1.0}, "optimism"), ({"misses": 0}, "a positive integer, got 0")],
+    ("options", "facts"),
+    [({"optimism": -1.0}, ("optimism", -1.0)), ({"misses": 0}, (0, "misses"))],
 )
-def test_options_that_cannot_be_are_refused_by_value(options: dict[str, float], sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
+def test_options_that_cannot_be_are_refused_by_value(options: dict[str, float], facts: tuple[object, ...]) -> None:
+    with refuses(InputError, *facts):
         TrustRegion(**options)  # type: ignore[arg-type]
 
 

@@ -11,6 +11,7 @@ from hypothesis.extra.numpy import arrays
 from ctxval import Task, specs
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 from ctxval.specs import SETS, Ball, Box, Outside, Polytope, Set, Union
+from facts import refuses
 
 TASK = Task([0.0, 0.0], horizon=4, dt=0.5, environment={"obstacle": [1.0, -0.5], "drift": [0.5, 0.0]})
 TRIANGLE = Polytope(A=[[-1.0, 0.0], [0.0, -2.0], [3.0, 3.0]], b=[0.0, 0.0, 3.0])
@@ -93,50 +94,50 @@ def test_batches_of_tasks_have_obstacles_of_their_own() -> None:
 
 
 def test_what_shrinks_away_is_refused() -> None:
-    with pytest.raises(InputError, match=r"nothing is left of a Ball of radius 0\.5 that shrinks by 0\.6"):
+    with refuses(InputError, "radius", 0.5, 0.6):
         Ball([0, 0], radius=0.5).grown(-0.6)
-    with pytest.raises(InputError, match="nothing is left of a Box"):
+    with refuses(InputError, 0.5):
         Box(low=[0, 0], high=[1, 3]).grown(-0.5)
-    with pytest.raises(InputError, match="nothing is left of a Polytope that shrinks by 1"):
+    with refuses(InputError, 1):
         TRIANGLE.grown(-1.0)
     both = Union([Ball([0, 0], radius=0.5), Ball([3, 0], radius=2.0)])
     assert len(both.grown(-0.6).sets) == 1
-    with pytest.raises(InputError, match="nothing is left of a Union of 2 sets"):
+    with refuses(InputError, 2):
         both.grown(-2.0)
-    with pytest.raises(InputError, match="nothing is left of a Box"):
+    with refuses(InputError, 0.5):
         Outside(Box(low=[0, 0], high=[1, 1])).grown(0.5)
 
 
 @pytest.mark.parametrize(
-    ("make", "expected"),
+    ("make", "facts"),
     [
-        (lambda: Ball([0, 0], radius=-1.0), "radius must be a positive number"),
-        (lambda: Ball([np.nan, 0], radius=1.0), "center of the Ball must be finite"),
-        (lambda: Box(low=[0, 0], high=[1]), "two equally long lists"),
-        (lambda: Box(low=[0, 2], high=[1, 1]), r"must be low < high, got \[0.0, 2.0\] and \[1.0, 1.0\]"),
-        (lambda: Box(low=[-np.inf], high=[np.inf]), "must have an end"),
-        (lambda: Box(), "must have an end: give low, high or both"),
-        (lambda: Box(low=["a"]), "low of the Box must be numbers"),
-        (lambda: Polytope(A=[1.0, 2.0], b=[1.0]), r"needs A \(q, k\) and b \(q,\), got \(2,\) and \(1,\)"),
-        (lambda: Polytope(A=[[0.0, 0.0]], b=[1.0]), "must not be zero"),
-        (lambda: Polytope(A=[[1.0], [-1.0]], b=[0.0, -1.0]), "must have an inside"),
-        (lambda: Union([]), "sets of a Union must name at least one set, got none"),
-        (lambda: Union([3]), "must be a set, such as Box"),
-        (lambda: specs.SETS.make("Cube", low=[0], high=[1]), "no set is called 'Cube'"),
+        (lambda: Ball([0, 0], radius=-1.0), ("radius", -1.0)),
+        (lambda: Ball([np.nan, 0], radius=1.0), ("Ball",)),
+        (lambda: Box(low=[0, 0], high=[1]), ("low", "high")),
+        (lambda: Box(low=[0, 2], high=[1, 1]), ("low", "high", [0.0, 2.0])),
+        (lambda: Box(low=[-np.inf], high=[np.inf]), ("Box",)),
+        (lambda: Box(), ("low", "high")),
+        (lambda: Box(low=["a"]), ("low", "Box")),
+        (lambda: Polytope(A=[1.0, 2.0], b=[1.0]), ("A", "b", (2,))),
+        (lambda: Polytope(A=[[0.0, 0.0]], b=[1.0]), ("Polytope",)),
+        (lambda: Polytope(A=[[1.0], [-1.0]], b=[0.0, -1.0]), ("Polytope", "b")),
+        (lambda: Union([]), ("Union",)),
+        (lambda: Union([3]), ("Union", 3)),
+        (lambda: specs.SETS.make("Cube", low=[0], high=[1]), ("Cube",)),
     ],
 )
-def test_a_set_that_cannot_be_is_refused(make: Any, expected: str) -> None:
-    with pytest.raises(InputError, match=expected):
+def test_a_set_that_cannot_be_is_refused(make: Any, facts: tuple[object, ...]) -> None:
+    with refuses((InputError, ShapeError, UnknownNameError), *facts):
         make()
 
 
 def test_sets_of_other_dimensions_are_refused_in_one_sentence() -> None:
     for of in (Box(low=[0], high=[1]), Polytope(A=[[1.0], [-1.0]], b=[1.0, 1.0]), Ball([0.0], radius=1.0)):
-        with pytest.raises(ShapeError, match=f"the {type(of).__name__} must have 2 dimensions.*got 1"):
+        with refuses(ShapeError, 2, 1, type(of).__name__):
             of.signed_distance(np.zeros((5, 2)), TASK)
-    with pytest.raises(ShapeError, match="needs a row for each of 5 times, got 3"):
+    with refuses(ShapeError, 5, 3):
         Ball(np.zeros((3, 2)), radius=1.0).signed_distance(np.zeros((5, 2)), TASK)
-    with pytest.raises(UnknownNameError, match="no entry of the task's environment is called 'obstacel'; did you mean"):
+    with refuses(UnknownNameError, "obstacel", "obstacle"):
         Ball("obstacel", radius=1.0).signed_distance(np.zeros((5, 2)), TASK)
 
 

@@ -8,6 +8,7 @@ import pytest
 from ctxval import Array, Task, Trajectory
 from ctxval.errors import InputError, ShapeError
 from ctxval.specs import STL, Ball, Box, ReachAvoid
+from facts import refuses
 
 TASK = Task([0.0], horizon=6, dt=0.1, environment={"limit": [0.9]})
 there = pytest.mark.skipif(importlib.util.find_spec("rtamt") is None, reason="rtamt is an extra")
@@ -20,7 +21,7 @@ def trajectory(states: Array) -> Trajectory:
 
 @pytest.mark.skipif(importlib.util.find_spec("rtamt") is not None, reason="rtamt is installed")
 def test_without_the_extra_one_sentence_says_how_to_get_it() -> None:
-    with pytest.raises(InputError, match=r"need rtamt: pip install 'ctxval\[stl\]'"):
+    with refuses(InputError, "ctxval[stl]", "rtamt"):
         STL("always (x < 1.0)", ["x"])
 
 
@@ -38,9 +39,9 @@ def test_a_formula_agrees_with_sets() -> None:
 def test_a_formula_knows_the_environment_and_refuses_what_it_cannot_read() -> None:
     states = np.full((7, 1), 0.5)
     assert STL("always (x < limit_0)", ["x"]).robustness(trajectory(states), TASK) == pytest.approx(0.4)
-    with pytest.raises(InputError, match="cannot be evaluated"):
+    with refuses(InputError, "y"):
         STL("always (y < 1)", ["x"]).robustness(trajectory(states), TASK)
-    with pytest.raises(InputError, match="needs times after the end of the task"):
+    with refuses(InputError, 0.6):
         STL("eventually[0.8:0.9] (x > 0)", ["x"]).robustness(trajectory(states), TASK)
-    with pytest.raises(ShapeError, match="1 variables and 2 components"):
+    with refuses(ShapeError, 1, 2):
         STL("always (x < 1.0)", ["x"], (0, 1))

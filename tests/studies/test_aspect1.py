@@ -23,6 +23,7 @@ from ctxval import (
 from ctxval.distances import FinalState, GoalError, MaximumDeviation, MeanDeviation, TrackingError
 from ctxval.errors import DesignError, InputError
 from ctxval.searches import Random
+from facts import assert_names, refuses
 
 DT = 0.1
 
@@ -88,7 +89,7 @@ def test_the_share_is_a_probability_under_the_distribution_of_tasks() -> None:
     report = aspect1.check(near, threshold=0.2, tasks=40)
     assert report.exceeding  # the search goes everywhere
     assert report.share == pytest.approx(1 - 0.05 ** (1 / 20))  # and no draw is near the far goals
-    assert report.distribution == "goal normal (mean 0.5, deviation 0.05), all else uniform"
+    assert_names(report.distribution, "goal")
 
 
 @pytest.mark.slow
@@ -129,7 +130,7 @@ def test_a_task_without_a_closed_loop_is_not_completed() -> None:
     assert 0 < len(report.failed) < 20
     assert report.completes is False
     assert report.worst.error is None
-    assert report.worst.reason.startswith("the goal is out of reach (task {'goal': 1.")
+    assert_names(report.worst.reason, "goal")
     assert all(one.parameters["goal"] > 1.5 for one in report.failed)
 
 
@@ -171,7 +172,7 @@ def test_a_changing_reference_is_followed() -> None:
 
 def test_tasks_without_a_goal_need_a_distance() -> None:
     aimless = cart(task=lambda p: Task([p.goal, 0.0], horizon=5, dt=DT))
-    with pytest.raises(InputError, match="neither a goal nor a reference"):
+    with refuses(InputError, "goal", "reference"):
         aspect1.check(aimless)
     report = aspect1.check(aimless, distance=lambda a, b, task: abs(b.final_state[..., 0]), tasks=4)
     assert report.units == ""
@@ -202,7 +203,7 @@ def test_on_model_is_the_ordinary_validation_with_the_model_in_the_place_of_the_
     assert validation.on_model(FinalState(1)).distances([[0.5], [1.0]]).tolist() == [0, 0]
     assert on_model.labels == validation.labels
     assert validation.on_model(GoalError(1), units="m").labels.units == "m"
-    with pytest.raises(InputError, match="distance must be"):
+    with refuses(InputError, "distance", "model_trajectory"):
         validation.on_model("far")  # type: ignore[arg-type]
 
 

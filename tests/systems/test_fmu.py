@@ -8,7 +8,6 @@ import io
 import json
 import os
 import pickle
-import re
 import shutil
 import subprocess
 import sys
@@ -40,6 +39,7 @@ from ctxval._util.describe import describe, first_difference
 from ctxval.cli import app
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 from ctxval.systems import FMU, fmu_process
+from facts import assert_names, refuses
 from rig_thorough import more
 
 fmpy = pytest.importorskip("fmpy")
@@ -171,7 +171,7 @@ def test_integer_parameters_are_set_as_integers(fmi2: Path) -> None:
 def test_a_failure_in_the_middle_ends_the_trajectory(path: Path) -> None:
     system = FMU(path, **NAMES)
     trajectory = system.execute(lambda t, x: np.array([1e4 if t >= 2 else 0.0]), TASK)
-    assert re.fullmatch(r"the FMU failed \(fmi.DoStep failed with status 2 \(discard\)\.\) at step 4", trajectory.ended)
+    assert_names(trajectory.ended, "FMU", 2, 4)
     assert np.isfinite(trajectory.states[:4]).all()
     assert np.isnan(trajectory.states[4:]).all()
     assert system.execute(feedback, TASK).ended == "complete"
@@ -220,7 +220,7 @@ def deadly(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_crash_ends_the_trajectory_and_not_the_process(deadly: Path) -> None:
     system = FMU(deadly, **NAMES)
     trajectory = system.execute(lambda t, x: np.array([1e4 if t >= 2 else 0.0]), TASK)
-    assert trajectory.ended == "the FMU crashed its process (SIGSEGV) at step 4"
+    assert_names(trajectory.ended, "FMU", 4)
     assert np.isfinite(trajectory.states[:4]).all()
     np.testing.assert_array_equal(
         system.execute(feedback, TASK).states, FMU(deadly, **NAMES).execute(feedback, TASK).states
@@ -264,7 +264,7 @@ def test_an_fmu_that_crashes_at_the_start_is_refused(tmp_path: Path) -> None:
     pytest.importorskip("pythonfmu")
     crash = "    def exit_initialization_mode(self):\n        import os; os._exit(7)\n\n    def do_step"
     source = CART_2.replace("    def do_step", crash)
-    with pytest.raises(InputError, match=r"pythonfmu\.fmu: the FMU crashed its process \(status 7\) when it was initi"):
+    with refuses(InputError, "pythonfmu.fmu", "FMU"):
         FMU(built(tmp_path, "pythonfmu", source), **NAMES)
 
 
@@ -283,7 +283,7 @@ def test_a_step_that_does_not_end_goes_with_its_execution(tmp_path: Path) -> Non
     )
     for timeout in (1.0, 5.0, 25.0, 125.0):  # on a busy machine, the process of the FMU starts late
         campaign = Campaign(validation, search=searches.Random()).run(1, timeout=timeout)
-        assert [trial.failure for trial in campaign.trials] == [f"the execution did not end within {timeout:g} s"]
+        assert_names([trial.failure for trial in campaign.trials], f"{timeout:g}")
         if (tmp_path / "pid").exists():
             break
     pid, deadline = int((tmp_path / "pid").read_text()), time.monotonic() + 30
@@ -370,18 +370,18 @@ def test_it_can_be_sent_to_another_process(path: Path) -> None:
 
 @pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_names_must_be_those_of_variables(path: Path) -> None:
-    with pytest.raises(UnknownNameError, match="no variable of the FMU is called 'velocity'"):
+    with refuses(UnknownNameError, "FMU", "velocity"):
         FMU(path, states=["position", "velocity"], inputs=["force"])
-    with pytest.raises(UnknownNameError, match="did you mean 'force'"):
+    with refuses(UnknownNameError, "force"):
         FMU(path, states=["position"], inputs=["forces"])
-    with pytest.raises(UnknownNameError, match="no state is called 'pos'"):
+    with refuses(UnknownNameError, "pos"):
         FMU(path, **NAMES, start={"pos": "position"})
-    with pytest.raises(InputError, match="names of different variables, got"):
+    with refuses(InputError, "states", "position"):
         FMU(path, states=["position", "position"], inputs=["force"])
 
 
 def test_states_must_be_real_numbers(fmi2: Path) -> None:
-    with pytest.raises(InputError, match="'teeth' must be one real number, it is of type Integer"):
+    with refuses(InputError, "teeth"):
         FMU(fmi2, states=["teeth"], inputs=["force"])
 
 
@@ -436,36 +436,38 @@ def heated(system: FMU, *start: float) -> list[float]:
 def test_a_parameter_sets_a_state_that_is_calculated(room: Path, options: dict[str, Any]) -> None:
     system = FMU(room, states=["T"], inputs=["heat"], **options)
     assert heated(system, 15.0) == heated(system, 15.0) == [15.0, 15.05, 15.0995]
-    with pytest.raises(ShapeError, match="the task must have the system's 1 states, got 2"):
+    with refuses(ShapeError, "task", 1, 2):
         heated(system, 15.0, 0.0)
 
 
 def test_a_calculated_state_without_its_parameter_is_refused_unless_it_starts_there(room: Path) -> None:
     system = FMU(room, states=["T"], inputs=["heat"])
-    with pytest.raises(InputError, match=r"stands at \[(20|19\.9).*calculates T.*\['T_start', 'gain'\]"):
+    with refuses(InputError, "T", "T_start", "gain"):
         heated(system, 15.0)
     assert heated(system, 20.0) == [20.0, 20.0, 20.0]
-    with pytest.raises(InputError, match=r"stands at \[(20|19\.9)"):
+    with refuses(InputError, "T_start", "gain"):
         heated(FMU(room, states=["T"], inputs=["heat"], start={"T": "gain"}), 15.0)
 
 
 def test_a_state_that_follows_from_others_must_be_so_in_the_task(room: Path) -> None:
     system = FMU(room, states=["T", "above"], inputs=["heat"], start={"T": "T_start"})
     assert heated(system, 15.0, -5.0) == [15.0, 15.05, 15.0995]
-    with pytest.raises(InputError, match=r"stands at \[1[45]\.\d*, -[45]"):
+    with refuses(InputError, "T_start", "gain"):
         heated(system, 15.0, 0.0)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "facts"),
     [
-        ({"start": {"T": "above"}}, r"start must .*got above \(causality output, continuous, initial calculated\)"),
-        ({"parameters": {"above": 1.0}}, r"parameters must name variables with a start value, got above"),
-        ({"inputs": ["T_start"]}, r"inputs or tunable parameters of the FMU, got T_start \(causality parameter, fixed"),
+        ({"start": {"T": "above"}}, ("start", "above")),
+        ({"parameters": {"above": 1.0}}, ("parameters", "above")),
+        ({"inputs": ["T_start"]}, ("FMU", "T_start")),
     ],
 )
-def test_what_the_description_does_not_allow_is_refused(room: Path, options: dict[str, Any], said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_what_the_description_does_not_allow_is_refused(
+    room: Path, options: dict[str, Any], facts: tuple[object, ...]
+) -> None:
+    with refuses(InputError, *facts):
         FMU(room, **{"states": ["T"], "inputs": ["heat"], **options})
 
 
@@ -473,7 +475,7 @@ def test_what_the_description_does_not_allow_is_refused(room: Path, options: dic
 def test_an_initial_state_that_is_not_taken_is_an_error(path: Path) -> None:
     # The start values go to the mass, so that the position stays where it was.
     system = FMU(path, **NAMES, start={"position": "mass"})
-    with pytest.raises(InputError, match=r"set to the initial state \[1\.0, -0\.5\], but stands at \[0\.0, -0\.5\]"):
+    with refuses(InputError, [1.0, -0.5], [0.0, -0.5]):
         system.execute(feedback, TASK)
 
 
@@ -488,10 +490,10 @@ def test_start_values_that_are_refused_are_an_error(fmi2: Path, monkeypatch: pyt
         setReal = getReal = setupExperiment = refuse  # noqa: N815
 
     monkeypatch.setattr("fmpy.simulation.instantiate_fmu", lambda *arguments, **options: Refusing())
-    with pytest.raises(fmu_process.Refused, match="start values of position, speed be set: calculated") as caught:
+    with refuses(fmu_process.Refused, "position", "speed", "calculated") as caught:
         unit.begin([1.0, 2.0], 0.1, 1)
     assert caught.value.args[1]
-    with pytest.raises(fmu_process.Refused, match=r"a\.fmu cannot be initialised: calculated"):
+    with refuses(fmu_process.Refused, "a.fmu", "calculated"):
         unit.begin([None, None], 0.1, 1)
 
 
@@ -510,7 +512,7 @@ def test_an_fmu_may_end_the_simulation(fmi3: Path, monkeypatch: pytest.MonkeyPat
     unit = fmu_process.Unit(str(unpacked(fmi3)), "a.fmu", [1, 2], [3], ["position", "speed"], {"mass": 3.0})
     assert unit.begin([1.0, 2.0], 0.1, 1) == [1.0, 2.0]
     answers = [unit.advance([0.0]) for _ in range(4)]
-    assert [reason for _, reason in answers] == ["", "", "", "terminated: the FMU ended the simulation"]
+    assert_names([reason for _, reason in answers], "FMU")
     assert answers[-1][0] is None
     unit.free()
 
@@ -541,13 +543,13 @@ def test_threads_do_not_disturb_each_other(path: Path) -> None:
 @pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_shapes_and_steps_must_fit(path: Path) -> None:
     system = FMU(path, **NAMES, step=0.04)
-    with pytest.raises(InputError, match=r"whole multiple of the step 0\.04 s, got 0\.1 s"):
+    with refuses(InputError, 0.04, 0.1):
         system.execute(feedback, TASK)
-    with pytest.raises(ShapeError, match="the system's 2 states, got 3"):
+    with refuses(ShapeError, 2, 3):
         FMU(path, **NAMES).execute(feedback, Task(np.zeros(3), horizon=2, dt=0.1))
-    with pytest.raises(ShapeError, match=r"inputs, shape \(1,\), got \(2,\)"):
+    with refuses(ShapeError, (1,), (2,)):
         FMU(path, **NAMES).execute(lambda t, x: x, TASK)
-    with pytest.raises(InputError, match="step must be a positive number of seconds, got 0"):
+    with refuses(InputError, "step", 0):
         FMU(path, **NAMES, step=0)
 
 
@@ -555,19 +557,19 @@ def test_other_files_are_refused(tmp_path: Path, fmi2: Path) -> None:
     junk = tmp_path / "junk.fmu"
     junk.write_bytes(b"junk")
     for wrong in (junk, tmp_path / "missing.fmu"):
-        with pytest.raises(InputError, match="cannot be read as an FMU"):
+        with refuses(InputError, "FMU"):
             FMU(wrong, **NAMES)
     hollow = tmp_path / "hollow.fmu"
     with zipfile.ZipFile(fmi2) as whole, zipfile.ZipFile(hollow, "w") as rest:
         rest.writestr("modelDescription.xml", whole.read("modelDescription.xml"))
-    with pytest.raises(InputError, match=r"hollow\.fmu cannot be instantiated: Cannot find shared library"):
+    with refuses(InputError, "hollow.fmu", "Cart.so"):
         FMU(hollow, **NAMES)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs FIFOs")
 def test_a_fifo_is_refused_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.fmu")
-    with pytest.raises(InputError, match=r"a\.fmu cannot be read as an FMU: it is a FIFO and not a regular file"):
+    with refuses(InputError, "a.fmu", "FMU", "FIFO"):
         FMU(tmp_path / "a.fmu", **NAMES)
 
 
@@ -576,13 +578,13 @@ def test_an_archive_that_cannot_be_unpacked_is_refused(tmp_path: Path, fmi2: Pat
     with zipfile.ZipFile(fmi2) as whole, zipfile.ZipFile(path, "w") as odd:
         odd.writestr("modelDescription.xml", whole.read("modelDescription.xml"))
         odd.writestr("C:/driver.dll", b"")
-    with pytest.raises(InputError, match=r"odd\.fmu cannot be unpacked: Illegal path C:/driver\.dll"):
+    with refuses(InputError, "odd.fmu", "C", "driver.dll"):
         FMU(path, **NAMES)
 
 
 def test_without_fmpy_the_extra_is_named(fmi2: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fmpy", None)
-    with pytest.raises(InputError, match=r"pip install 'ctxval\[fmu\]'"):
+    with refuses(InputError, "ctxval[fmu]"):
         FMU(fmi2, **NAMES)
 
 

@@ -9,6 +9,7 @@ from ctxval import Task, Trajectory, systems, testing
 from ctxval._util.arrays import Array
 from ctxval.core.controller import Feedback
 from ctxval.errors import ExecutionError, InputError
+from facts import refuses
 
 TASK = Task([1.0, -0.5], horizon=8, dt=0.1)
 
@@ -50,7 +51,7 @@ def test_it_keeps_the_contract_of_a_system(system: systems.Function) -> None:
 
 
 def test_a_trajectory_is_passed_on_as_it_is() -> None:
-    stopped = Trajectory(TASK.times[:3], np.zeros((3, 2)), np.zeros((2, 1)), ended="the operator stopped it")
+    stopped = Trajectory(TASK.times[:3], np.zeros((3, 2)), np.zeros((2, 1)), ended="operator stop")
     assert systems.Function(lambda controller, task: stopped).execute(feedback, TASK) is stopped
 
 
@@ -62,10 +63,10 @@ def test_a_trajectory_is_passed_on_as_it_is() -> None:
     ],
 )
 def test_anything_else_is_a_failed_execution(returned: Any) -> None:
-    with pytest.raises(ExecutionError, match=r"must return a Trajectory, or states .* with H = 8: "):
+    with refuses(ExecutionError, "H", 8):
         systems.Function(lambda controller, task: returned).execute(feedback, TASK)
 
 
 def test_what_is_no_function_is_refused() -> None:
-    with pytest.raises(InputError, match="execute must be a function, got 3"):
+    with refuses(InputError, "execute", 3):
         systems.Function(3)  # type: ignore[arg-type]

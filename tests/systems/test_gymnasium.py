@@ -18,6 +18,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.describe import describe, first_difference
 from ctxval.errors import InputError, ShapeError
 from ctxval.systems import Gymnasium
+from facts import assert_names, refuses
 
 REACHER = Task([0.5, 0.2, 0.1, 0.1, 0, 0, 0, 0], horizon=20, dt=0.02)
 PENDULUM = Task([0.0, 0.1, 0.0, 0.0], horizon=20, dt=0.04)
@@ -42,7 +43,7 @@ def test_an_object_that_is_no_environment_is_refused() -> None:
 
         def step(self, u: Array) -> None: ...
 
-    with pytest.raises(InputError, match="which has no action_space"):
+    with refuses(InputError, "action_space"):
         Gymnasium(Robot())
 
 
@@ -80,15 +81,15 @@ def test_an_environment_is_used_itself_and_copied_for_another_execution_at_the_s
     described = describe(system)["environment"]
     assert described["id"] == "Reacher-v5"
     assert "ReacherEnv" in str(described["class"])
-    with pytest.raises(InputError, match="options are for environments that are made"):
+    with refuses(InputError, "width"):
         Gymnasium(environment, width=100)
-    with pytest.raises(InputError, match="the environment must be a single one"):
+    with refuses(InputError, "environment", "SyncVectorEnv"):
         Gymnasium(gymnasium.make_vec("Reacher-v5", num_envs=2))
 
 
 def test_a_terminated_episode_ends_the_trajectory() -> None:
     trajectory = Gymnasium("InvertedPendulum-v5").execute(idle, PENDULUM)
-    assert trajectory.ended == "terminated: the environment ended the episode at step 7"
+    assert_names(trajectory.ended, "ended", 7)
     assert np.isfinite(trajectory.states[:8]).all()
     assert abs(trajectory.states[7, 1]) > 0.2  # what the environment calls fallen
     assert np.isnan(trajectory.states[8:]).all()
@@ -107,7 +108,7 @@ def test_a_time_limit_ends_the_trajectory_only_before_the_horizon() -> None:
         return Gymnasium("Reacher-v5", **options).execute(damp, task).ended
 
     assert ended(50) == "complete"
-    assert ended(51) == "the environment truncated the episode at step 50"
+    assert_names(ended(51), 50)
     assert ended(51, max_episode_steps=-1) == "complete"
 
 
@@ -170,7 +171,7 @@ def test_a_state_may_hold_more_than_positions_and_velocities() -> None:
     assert system.state().shape == (10,)
     start = [0.0, 0.0, 0.1, 0.1, 0, 0, 0, 0]
     assert system.execute(damp, Task([*start, 0.21, 0.0], horizon=5, dt=0.02)).states.shape == (6, 10)
-    with pytest.raises(InputError, match=r"but stands at \[.*0\.2.*\]"):
+    with refuses(InputError, 0.1):
         system.execute(damp, Task([*start, 0.0, 0.0], horizon=5, dt=0.02))
 
 
@@ -178,48 +179,48 @@ def test_a_state_may_hold_more_than_positions_and_velocities() -> None:
 
 
 def test_the_time_step_must_be_that_of_the_environment() -> None:
-    with pytest.raises(InputError, match=r"that of the environment, 0\.02 s, got 0\.05 s"):
+    with refuses(InputError, 0.02, 0.05):
         Gymnasium("Reacher-v5").execute(damp, Task(REACHER.initial_state, horizon=3, dt=0.05))
-    with pytest.raises(InputError, match=r"that of the environment, 0\.05 s, got 0\.1 s"):
+    with refuses(InputError, 0.05, 0.1):
         swing(dt=0.1)
-    with pytest.raises(InputError, match="seconds in one step of the environment, got None"):
+    with refuses(InputError, "None", "dt"):
         Gymnasium("MountainCarContinuous-v0", get_state=swing_state, set_state=set_swing_state)
 
 
 @pytest.mark.parametrize(
-    ("name", "sentence"),
+    ("name", "facts"),
     [
-        ("Reacher-v99", "'Reacher-v99' cannot be made"),
-        ("no environment", "cannot be made"),
-        ("CartPole-v1", r"continuous actions, a Box, got Discrete\(2\)"),
-        ("Pendulum-v1", r"give the functions get_state\(environment\) -> x"),
+        ("Reacher-v99", ("Reacher-v99",)),
+        ("no environment", ("no environment", "IDs")),
+        ("CartPole-v1", ("Discrete", 2)),
+        ("Pendulum-v1", ("get_state", "set_state")),
     ],
 )
-def test_environments_that_cannot_be_used_are_refused(name: str, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
+def test_environments_that_cannot_be_used_are_refused(name: str, facts: tuple[object, ...]) -> None:
+    with refuses(InputError, *facts):
         Gymnasium(name)
 
 
 def test_shapes_must_fit() -> None:
     system = Gymnasium("Reacher-v5")
-    with pytest.raises(ShapeError, match="at least 8 states, 4 qpos and 4 qvel, got 4"):
+    with refuses(ShapeError, 8, 4):
         system.execute(damp, Task(np.zeros(4), horizon=3, dt=0.02))
-    with pytest.raises(ShapeError, match="the system's 8 states, got 9"):
+    with refuses(ShapeError, 8, 9):
         system.execute(damp, Task(np.zeros(9), horizon=3, dt=0.02))
-    with pytest.raises(ShapeError, match=r"the system's 2 inputs, shape \(2,\), got \(1,\)"):
+    with refuses(ShapeError, 2, (2,), (1,)):
         system.execute(idle, REACHER)
-    with pytest.raises(ShapeError, match=r"one task at a time, got a batch of shape \(2,\)"):
+    with refuses(ShapeError, (2,)):
         system.execute(damp, Task(np.zeros((2, 8)), horizon=3, dt=0.02))
 
 
 def test_an_input_that_is_not_finite_ends_the_trajectory() -> None:
     trajectory = Gymnasium("InvertedPendulum-v5").execute(lambda t, x: np.full(1, np.nan if t == 3 else 0.0), PENDULUM)
-    assert trajectory.ended == "an input is not finite at step 4"
+    assert_names(trajectory.ended, 4)
 
 
 def test_without_gymnasium_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(InputError, match=r"pip install 'ctxval\[mujoco\]'"):
+    with refuses(InputError, "ctxval[mujoco]"):
         Gymnasium("Reacher-v5")
 
 
@@ -307,5 +308,5 @@ def test_an_environment_that_cannot_be_closed_hides_no_reason() -> None:
             raise OSError("the port is gone")
 
     system = Gymnasium(Stuck, get_state=lambda environment: [0.0], set_state=lambda environment, x: None)
-    with pytest.raises(RuntimeError, match="the motor is off"):
+    with refuses(RuntimeError, "motor"):
         system.execute(lambda t, x: np.zeros(1), Task([0.0], horizon=1, dt=0.1))

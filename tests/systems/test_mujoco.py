@@ -16,6 +16,7 @@ from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances
 from ctxval._util.arrays import Array
 from ctxval._util.describe import describe, first_difference
 from ctxval.errors import InputError, ShapeError, UnknownNameError
+from facts import assert_names, refuses
 
 ARM = """
 <mujoco>
@@ -194,7 +195,7 @@ def test_a_diverging_simulation_is_told_from_a_healthy_one(tmp_path: Path, monke
     system = systems.MuJoCo(UNSTABLE)
     task = Task(system.state([[0.0], [0.1], [0.0]]), horizon=30, dt=0.05)
     trajectory = system.execute(lambda t, x: np.zeros((*x.shape[:-1], 1)), task)
-    assert trajectory.ended == "terminated: MuJoCo warned of BADQACC at step 2"
+    assert_names(trajectory.ended, "MuJoCo", "BADQACC", 2)
     assert trajectory.finite.tolist() == [True, False, True]
     assert np.isnan(trajectory.states[1, 2:]).all()
     alone = system.execute(lambda t, x: np.zeros(1), task[1])
@@ -211,7 +212,7 @@ def test_an_input_that_is_not_finite_never_becomes_zero(arm: systems.MuJoCo) -> 
         return u
 
     trajectory = arm.execute(broken, task)
-    assert trajectory.ended == "an input is not finite at step 4"
+    assert_names(trajectory.ended, 4)
     assert trajectory.finite.tolist() == [True, True, False, True, True]
     whole = arm.execute(feedback, task)
     np.testing.assert_array_equal(trajectory.states[[0, 1, 3, 4]], whole.states[[0, 1, 3, 4]])
@@ -238,20 +239,20 @@ def test_a_diverged_execution_is_a_failed_trial(tmp_path: Path, monkeypatch: pyt
 
 def test_the_time_step_must_fit(arm: systems.MuJoCo) -> None:
     assert arm.dt == pytest.approx(0.02)
-    with pytest.raises(InputError, match=r"0\.01 s x 2 = 0\.02 s, got 0\.05 s"):
+    with refuses(InputError, 0.01, 2, 0.02):
         arm.execute(feedback, Task(np.zeros(6), horizon=3, dt=0.05))
 
 
 def test_the_shapes_must_fit(arm: systems.MuJoCo) -> None:
-    with pytest.raises(ShapeError, match=r"6 states, 2 qpos, 2 qvel and 2 coordinates of sites, got 4"):
+    with refuses(ShapeError, 6, 2, 4):
         arm.execute(feedback, Task(np.zeros(4), horizon=3, dt=0.02))
     task = arm_task(arm)
-    with pytest.raises(ShapeError, match="the model's 2 inputs, got 1"):
+    with refuses(ShapeError, 2, 1):
         arm.execute(lambda t, x: x[..., :1], task)
 
 
 def test_an_initial_state_must_have_the_sites_where_they_are(arm: systems.MuJoCo) -> None:
-    with pytest.raises(InputError, match=r"sites' positions at its qpos, \[0\.5, 0\.0\], got \[0\.0, 0\.0\]"):
+    with refuses(InputError, [0.5, 0.0], [0.0, 0.0]):
         arm.execute(feedback, Task(np.zeros(6), horizon=3, dt=0.02))
 
 
@@ -260,34 +261,34 @@ def test_models_come_from_text_and_from_files(tmp_path: Path) -> None:
     path.write_text(ARM)
     for source in (path, str(path)):
         assert first_difference(describe(systems.MuJoCo(source)), describe(systems.MuJoCo(ARM))) is None
-    with pytest.raises(InputError, match=r"no\.xml.*cannot be read"):
+    with refuses(InputError, "no.xml"):
         systems.MuJoCo(tmp_path / "no.xml")
     os.mkfifo(tmp_path / "fifo.xml")
-    with pytest.raises(InputError, match=r"fifo\.xml' cannot be read: it is a FIFO and not a regular file"):
+    with refuses(InputError, "fifo.xml", "FIFO"):
         systems.MuJoCo(tmp_path / "fifo.xml")
-    with pytest.raises(InputError, match="cannot compile"):
+    with refuses(InputError, "XML_ERROR_MISMATCHED_ELEMENT", 14):
         systems.MuJoCo("<mujoco><worldbody><body/></mujoco>")
-    with pytest.raises(InputError, match="cannot compile"):
+    with refuses(InputError, "joint1", 1):
         systems.MuJoCo(ARM.replace("joint1", "joint2", 1))
 
 
 @pytest.mark.parametrize("substeps", [0, -1, 1.5, True])
 def test_substeps_are_a_positive_integer(substeps: Any) -> None:
-    with pytest.raises(InputError, match="substeps must be a positive integer"):
+    with refuses(InputError, "substeps"):
         systems.MuJoCo(ARM, substeps=substeps)
 
 
 def test_sites_and_axes_must_be_known() -> None:
     assert systems.MuJoCo(ARM, sites="tip").sites == ("tip",)
-    with pytest.raises(UnknownNameError, match="did you mean 'tip'"):
+    with refuses(UnknownNameError, "tip"):
         systems.MuJoCo(ARM, sites=("tips",))
-    with pytest.raises(InputError, match="letters of 'xyz'"):
+    with refuses(InputError, "xyz", "axes"):
         systems.MuJoCo(ARM, sites=("tip",), axes="xw")
 
 
 def test_without_mujoco_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)  # an import of it fails
-    with pytest.raises(InputError, match=r"pip install 'ctxval\[mujoco\]'"):
+    with refuses(InputError, "ctxval[mujoco]"):
         systems.MuJoCo(ARM)
 
 

@@ -24,6 +24,7 @@ from ctxval.errors import ExecutionError, InputError
 from ctxval.systems import Subprocess
 from ctxval.systems import subprocess as adapter
 from ctxval.systems import subprocess as supervised
+from facts import assert_names, refuses
 from rig_thorough import more
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.05]])
@@ -99,9 +100,9 @@ import numpy as np
 states = np.zeros((21, 2))
 states[5:] = np.nan
 np.savez(sys.argv[-1] + "/trajectory.npz", times=np.arange(21) / 10, states=states, inputs=np.zeros((20, 1)),
-         ended="the motor cut out")
+         ended="motor stalled")
 """
-    assert python(tmp_path, code).execute(designed(), TASK).ended == "the motor cut out"
+    assert python(tmp_path, code).execute(designed(), TASK).ended == "motor stalled"
 
 
 def test_names_and_units_go_into_the_files_and_folders_can_be_kept(tmp_path: Path) -> None:
@@ -132,7 +133,7 @@ def test_measured_times_that_jitter_are_brought_to_those_of_the_task(tmp_path: P
 
 @pytest.mark.parametrize("clock", ["t * 0.3", "t * 0.1 * 1.02", "t * 0.1 + (0.04 if t == 7 else 0)", "t * 0.001"])
 def test_a_rig_that_does_not_keep_the_time_step_is_refused_with_its_period(clock: str, tmp_path: Path) -> None:
-    with pytest.raises(ExecutionError, match=r"steps of 0\.1 s: .* measured period is"):
+    with refuses(ExecutionError, 0.1, "trajectory"):
         python(tmp_path, RIG.replace('t * task["dt"]', clock)).execute(designed(), TASK)
 
 
@@ -166,7 +167,7 @@ def test_a_rig_has_time_to_stop_and_its_recording_is_kept(tmp_path: Path) -> Non
     system = python(tmp_path, STOPS, str(tmp_path), timeout=0.5)
     trajectory = system.execute(designed(), TASK)
     assert (tmp_path / "stopped").exists()
-    assert trajectory.ended == "the command did not end within 0.5 s and was stopped"
+    assert_names(trajectory.ended, 0.5, "stopped")
     space = TaskSpace(speed=(-0.6, -0.5))
     validation = Validation(
         space=space,
@@ -187,7 +188,7 @@ def test_a_rig_has_time_to_stop_and_its_recording_is_kept(tmp_path: Path) -> Non
 def test_a_rig_that_ignores_sigterm_is_killed_after_the_grace_period(tmp_path: Path) -> None:
     code = SPAWN + "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)"
     began = time.monotonic()
-    with pytest.raises(ExecutionError, match="was stopped"):
+    with refuses(ExecutionError, 0.3):
         python(tmp_path, code, str(tmp_path), timeout=0.3, grace=0.1).execute(designed(), TASK)
     assert time.monotonic() - began < 20
     assert gone(int((tmp_path / "pid").read_text()))
@@ -206,27 +207,27 @@ def test_an_interrupted_rig_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize(
-    ("code", "sentence"),
+    ("code", "facts"),
     [
-        ("import sys; print('warming up', file=sys.stderr); sys.exit('the brake is on')", "status 1: the brake is on$"),
-        ("raise RuntimeError('no power')", "ended with status 1: RuntimeError: no power$"),
-        ("import sys; sys.exit(7)", "ended with status 7: nothing on stderr$"),
-        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "ended by SIGKILL: nothing on stderr"),
-        ("pass", r"wrote neither trajectory\.npz nor trajectory\.csv"),
+        ("import sys; print('warming up', file=sys.stderr); sys.exit('the brake is on')", (1,)),
+        ("raise RuntimeError('no power')", (1, "RuntimeError")),
+        ("import sys; sys.exit(7)", (7,)),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", ("SIGKILL",)),
+        ("pass", ("trajectory.npz", "trajectory.csv")),
         (
             "import sys; open(sys.argv[-1] + '/trajectory.npz', 'w').write('junk')",
-            r"cannot be used: .*trajectory\.npz cannot be read",
+            ("trajectory.npz",),
         ),
-        ("import sys; open(sys.argv[-1] + '/trajectory.csv', 'w').write('a,b\\n1,2\\n3,4\\n')", "columns t, x0"),
-        (RIG.replace('task["horizon"]', "5"), r"states of shape \(21, 2\), got \(6, 2\)"),
+        ("import sys; open(sys.argv[-1] + '/trajectory.csv', 'w').write('a,b\\n1,2\\n3,4\\n')", ("trajectory.csv",)),
+        (RIG.replace('task["horizon"]', "5"), ((21, 2), (6, 2))),
         (
             RIG.replace('t * task["dt"]', "t * 0.2"),
-            r"steps of 0\.1 s: time 1 must be 0\.1 s after",
+            (0.1, 1),
         ),
     ],
 )
-def test_a_failed_execution_says_why(code: str, sentence: str, tmp_path: Path) -> None:
-    with pytest.raises(ExecutionError, match=sentence):
+def test_a_failed_execution_says_why(code: str, facts: tuple[object, ...], tmp_path: Path) -> None:
+    with refuses(ExecutionError, *facts):
         python(tmp_path, code).execute(designed(), TASK)
 
 
@@ -304,12 +305,10 @@ def test_a_command_ends_with_a_campaign_that_is_killed(workers: int, tmp_path: P
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
-@pytest.mark.parametrize(
-    ("end", "sentence"), [("time.sleep(60)", "did not end within 1 s and was stopped"), ("sys.exit(3)", "status 3")]
-)
-def test_whatever_the_command_started_ends_with_it(end: str, sentence: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("end", "facts"), [("time.sleep(60)", (1, "end")), ("sys.exit(3)", (3,))])
+def test_whatever_the_command_started_ends_with_it(end: str, facts: tuple[object, ...], tmp_path: Path) -> None:
     started = time.monotonic()
-    with pytest.raises(ExecutionError, match=sentence):
+    with refuses(ExecutionError, *facts):
         python(tmp_path, SPAWN + end, str(tmp_path), timeout=1).execute(designed(), TASK)
     assert time.monotonic() - started < 20
     assert gone(int((tmp_path / "pid").read_text()))
@@ -343,7 +342,7 @@ def escaped(folder: Path, count: int = 1) -> list[int]:
 @LINUX
 @pytest.mark.parametrize("end", ["", "sys.exit(3)", *more("time.sleep(60)"), "os.kill(os.getpid(), 9)"])
 def test_what_left_the_group_ends_with_the_command(end: str, tmp_path: Path) -> None:
-    with pytest.raises(ExecutionError, match=r"neither|status 3|not end within 1 s|SIGKILL"):
+    with refuses(ExecutionError):
         python(tmp_path, ESCAPE + end, str(tmp_path), timeout=1).execute(designed(), TASK)
     (pid,) = escaped(tmp_path)
     assert gone(pid)
@@ -353,7 +352,7 @@ def test_what_left_the_group_ends_with_the_command(end: str, tmp_path: Path) -> 
 @LINUX
 def test_many_that_have_left_the_group_end_too(tmp_path: Path) -> None:
     code = "import os, sys\nfor _ in range(3):\n    os.fork()\n" + ESCAPE + "time.sleep(60)"
-    with pytest.raises(ExecutionError, match="not end within 1 s"):
+    with refuses(ExecutionError, 1):
         python(tmp_path, code, str(tmp_path), timeout=1).execute(designed(), TASK)
     assert all(gone(pid) for pid in escaped(tmp_path, 8))
 
@@ -394,7 +393,7 @@ def test_a_supervisor_that_is_killed_or_stopped_takes_its_command_with_it(signal
     code = SPAWN + f"import os, signal; time.sleep(0.5); os.kill(os.getppid(), signal.{signal_}); time.sleep(60)"
     rig = python(tmp_path, code, str(tmp_path), timeout=2)
     rig.patience = 0.2
-    with pytest.raises(ExecutionError, match=r"the process that watches the command was killed|did not end within 2 s"):
+    with refuses(ExecutionError):
         rig.execute(designed(), TASK)
     assert gone(int((tmp_path / "pid").read_text()))
 
@@ -419,7 +418,7 @@ def test_all_is_killed_when_we_are_interrupted(tmp_path: Path, monkeypatch: pyte
 def test_the_status_of_the_shortest_command_is_never_lost() -> None:
     system = Subprocess("false", timeout=30)
     for _ in range(15):
-        with pytest.raises(ExecutionError, match="the command ended with status 1: nothing on stderr"):
+        with refuses(ExecutionError, 1):
             system.execute(designed(), TASK)
 
 
@@ -429,7 +428,7 @@ def test_a_program_that_cannot_be_started_any_more_is_a_failed_execution(tmp_pat
     program.chmod(0o755)
     system = Subprocess([str(program)], timeout=5)
     program.unlink()
-    with pytest.raises(ExecutionError, match="the command cannot be started: No such file or directory"):
+    with refuses(ExecutionError):
         system.execute(designed(), TASK)
 
 
@@ -443,19 +442,19 @@ def test_a_timeout_may_be_longer_than_the_system_can_wait(tmp_path: Path) -> Non
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs FIFOs and devices")
 @pytest.mark.parametrize("name", ["trajectory.npz", "trajectory.csv"])
 @pytest.mark.parametrize(
-    ("make", "reason"),
+    "make",
     [
-        ("os.mkfifo(path)", "it is a FIFO and not a regular file"),
-        ("os.symlink('/dev/zero', path)", "it is a device and not a regular file"),
-        ("os.symlink('/dev/tty', path)", "cannot be read"),
-        ("os.mkdir(path)", "it is a folder"),
-        ("os.symlink('nowhere', path)", "No such file or directory"),
-        ("os.truncate(os.open(path, os.O_CREAT | os.O_WRONLY), 2**33)", "it has 8589934592 bytes, and at most"),
+        "os.mkfifo(path)",
+        "os.symlink('/dev/zero', path)",
+        "os.symlink('/dev/tty', path)",
+        "os.mkdir(path)",
+        "os.symlink('nowhere', path)",
+        "os.truncate(os.open(path, os.O_CREAT | os.O_WRONLY), 2**33)",
     ],
 )
-def test_what_is_no_file_is_neither_waited_for_nor_read(make: str, reason: str, name: str, tmp_path: Path) -> None:
+def test_what_is_no_file_is_neither_waited_for_nor_read(make: str, name: str, tmp_path: Path) -> None:
     code = f"import os, sys; path = sys.argv[-1] + '/{name}'; {make}"
-    with pytest.raises(ExecutionError, match=f"the command's trajectory cannot be used: .*{reason}"):
+    with refuses(ExecutionError, name):
         python(tmp_path, code, timeout=5).execute(designed(), TASK)
 
 
@@ -468,13 +467,13 @@ def test_a_trajectory_may_be_a_link_to_a_file(tmp_path: Path) -> None:
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs FIFOs")
 def test_a_fifo_in_place_of_what_the_command_wrote_on_stderr_is_not_waited_for(tmp_path: Path) -> None:
     code = "import os, sys; p = sys.argv[-1] + '/stderr.txt'; os.unlink(p); os.mkfifo(p); sys.exit('the brake is on')"
-    with pytest.raises(ExecutionError, match="status 1: the brake is on"):
+    with refuses(ExecutionError, 1):
         python(tmp_path, code).execute(designed(), TASK)
 
 
 def test_more_numbers_than_the_task_has_are_not_read(tmp_path: Path) -> None:
     code = "import sys; open(sys.argv[-1] + '/trajectory.csv', 'w').write('t,x0,x1,u0\\n' + '0,1,2,3\\n' * 22)"
-    with pytest.raises(ExecutionError, match=r"trajectory\.csv must have 21 rows below its header, and has more"):
+    with refuses(ExecutionError, "trajectory.csv", 21):
         python(tmp_path, code).execute(designed(), TASK)
 
 
@@ -489,19 +488,19 @@ def test_it_does_not_depend_on_the_current_folder(tmp_path: Path, monkeypatch: p
 
 
 def test_a_controller_that_cannot_leave_the_process_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="only affine feedback"):
+    with refuses(InputError, "LQR", "iLQR"):
         python(tmp_path, RIG).execute(lambda t, x: x[:1], TASK)
 
 
 @pytest.mark.parametrize("command", ["", [], "no-such-program --fast"])
 def test_programs_must_exist(command: Any) -> None:
-    with pytest.raises(InputError, match="a program that can be run"):
+    with refuses(InputError, "command"):
         Subprocess(command, timeout=1)
 
 
 @pytest.mark.parametrize("timeout", [0, -1, None, float("nan")])
 def test_timeouts_must_be_positive(timeout: Any) -> None:
-    with pytest.raises(InputError, match="timeout must be a positive number of seconds"):
+    with refuses(InputError, "timeout"):
         Subprocess(["sh"], timeout=timeout)
 
 
@@ -532,7 +531,7 @@ def test_a_killed_command_costs_its_own_trial_and_nothing_else(
     campaign.run(6, workers=workers)
     thread.join()
     (killed,) = campaign.failed
-    assert str(killed.failure).endswith("the command was ended by SIGKILL: nothing on stderr")
+    assert_names(str(killed.failure), "SIGKILL")
     assert campaign.executions == 6
     expected = [None if number == killed.number else distance for number, distance in enumerate(whole)]
     assert [trial.distance for trial in campaign.trials] == expected

@@ -15,6 +15,7 @@ import pytest
 from ctxval._util.progress import Progress, advance, stage
 from ctxval.errors import CampaignError, InputError
 from ctxval.web.service import BackgroundProcess
+from facts import assert_names, refuses
 
 pytestmark = pytest.mark.slow
 
@@ -62,7 +63,7 @@ def process(stages: list[Progress], tmp_path: Path) -> Iterator[BackgroundProces
 def test_jobs_run_in_one_other_process_that_survives_their_errors_and_is_started_again_if_it_dies(
     process: BackgroundProcess, stages: list[Progress], tmp_path: Path
 ) -> None:
-    with pytest.raises(CampaignError, match=r"there is no such experiment\."):
+    with refuses(CampaignError):
         process.submit(own_process).result(WAIT)
     (tmp_path / "campaign").touch()
     stages.clear()
@@ -71,13 +72,13 @@ def test_jobs_run_in_one_other_process_that_survives_their_errors_and_is_started
     assert (served, number) == ("opened", 1)
     assert child != os.getpid()
     assert second.result(WAIT) == ("opened", child, 2)
-    assert [each.stage for each in stages[:2]] == ["loading the experiment", "working"]
+    assert_names([each.stage for each in stages[:2]], "working")
 
-    with pytest.raises(CampaignError, match="KeyboardInterrupt"):
+    with refuses(CampaignError, "KeyboardInterrupt"):
         process.submit(fail).result(WAIT)
     assert process.submit(own_process).result(WAIT) == ("opened", child)
 
-    with pytest.raises(CampaignError, match=r"ended with the status -9\. Try again\."):
+    with refuses(CampaignError, -9):
         process.submit(die).result(WAIT)
     again = process.submit(own_process).result(WAIT)[1]
     assert again != child

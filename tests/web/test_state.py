@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from ctxval._util.progress import Progress
 from ctxval.web.state import Work
+from facts import assert_names
 
 
 def test_work_that_cannot_be_counted_says_what_it_is() -> None:
@@ -25,4 +26,5 @@ def test_work_that_is_counted_says_how_long_it_takes() -> None:
         "seconds": 5,
     }
     later = counted.at(Progress("another stage", 20, 40, "tasks")).to_json()
-    assert (later["text"], later["seconds"]) == ("another stage, 20/40 tasks, 0 s left", 5)
+    assert later["seconds"] == 5
+    assert_names(later["text"], 20, 40, "tasks", 0)

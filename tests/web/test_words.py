@@ -13,6 +13,7 @@ from ctxval.campaign.dynamics import PREDICTION
 from ctxval.core.trial import Origin, Trial
 from ctxval.learning import ExecutionPrediction
 from ctxval.web.page import in_words, why
+from facts import assert_names
 
 PREDICTED = ExecutionPrediction(4, tuple(np.linspace(0.1, 0.3, 21)), 0.05, (1,), ((0.0,),), ((0.1,),), 0.0)
 
@@ -78,4 +79,4 @@ def test_no_note_is_too_odd(note: dict[str, Any], units: str, origin: Origin) ->
 
 
 def test_a_task_in_one_line() -> None:
-    assert in_words(trial(), {"goal": "rad"}) == "goal = 0.25 rad, load = [1, 2]"
+    assert_names(in_words(trial(), {"goal": "rad"}), "goal", 0.25, "rad", [1, 2])

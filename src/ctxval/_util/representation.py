@@ -13,6 +13,7 @@ import numbers
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import PurePath
@@ -23,9 +24,20 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.texts import plain, quoted, shortened, visible
 
-LONGEST, LINES = 600, 5  # characters and lines of one object
-LINE, _CALL = 150, 240  # characters of one line of several, and of an object in a single line
-_VALUE, _ITEMS = 90, 6  # characters of a value inside an object, and items of a collection that are shown
+
+@dataclass(frozen=True)
+class Widths:
+    """How many characters of an object are shown."""
+
+    whole: int = 600
+    lines: int = 5  # number of lines
+    line: int = 150  # one line of several
+    call: int = 240  # an object in a single line
+    value: int = 90  # a value inside an object
+    items: int = 6  # number of items of a collection
+
+
+WIDTHS = Widths()
 
 
 class Shown(str):
@@ -34,7 +46,7 @@ class Shown(str):
     __slots__ = ()
 
 
-def line(text: object, longest: int = LINE) -> str:
+def line(text: object, longest: int = WIDTHS.line) -> str:
     """Return a text of anybody's as one line: control characters written out, the middle of a long one left out."""
     return shortened(" ".join(visible(plain(text)).split()), longest)
 
@@ -45,19 +57,20 @@ def cut(text: str, longest: int) -> str:
 
 def lines(head: str, *rows: str) -> str:
     """Return a first line, and indented ones below it."""
-    shortened_rows = [cut(row, LINE) for row in (head, *(f"  {row}" for row in rows[: LINES - 1]))]
+    shortened_rows = [cut(row, WIDTHS.line) for row in (head, *(f"  {row}" for row in rows[: WIDTHS.lines - 1]))]
     text = "\n".join(shortened_rows)
-    return text if len(text) <= LONGEST else "\n".join(cut(row, LONGEST // LINES - 1) for row in shortened_rows)
+    short = WIDTHS.whole // WIDTHS.lines - 1
+    return text if len(text) <= WIDTHS.whole else "\n".join(cut(row, short) for row in shortened_rows)
 
 
 def call(owner: object, /, *items: object, **fields: object) -> str:
     """Return ``Name(item, field=value)`` in one line; fields that are None are left out."""
-    return cut(_called(type(owner).__name__, items, fields), _CALL)
+    return cut(_called(type(owner).__name__, items, fields), WIDTHS.call)
 
 
 def _called(name: str, items: Iterable[object], fields: Mapping[str, object]) -> str:
     named = (f"{line(key, 40)}={shown(value)}" for key, value in fields.items() if value is not None)
-    return f"{line(name, _VALUE)}({', '.join([*map(shown, items), *named])})"
+    return f"{line(name, WIDTHS.value)}({', '.join([*map(shown, items), *named])})"
 
 
 def fields_of(owner: Any) -> dict[str, Any]:
@@ -81,9 +94,10 @@ class ShortRepr:
     def __repr__(self) -> str:
         fields = fields_of(self)
         text = _called(type(self).__name__, [], fields)
-        if len(text) <= _CALL:
+        if len(text) <= WIDTHS.call:
             return text
-        return lines(line(type(self).__name__, _VALUE), *(f"{name}: {shown(value)}" for name, value in fields.items()))
+        rows = (f"{name}: {shown(value)}" for name, value in fields.items())
+        return lines(line(type(self).__name__, WIDTHS.value), *rows)
 
 
 def options(owner: object) -> dict[str, Any]:
@@ -98,7 +112,7 @@ def shown(value: Any, depth: int = 3) -> str:
         case Shown() | None | bool() | np.bool_():
             return str(value)
         case str() | PurePath():
-            return cut(visible(repr(shortened(plain(value), _VALUE))), 2 * _VALUE)
+            return cut(visible(repr(shortened(plain(value), WIDTHS.value))), 2 * WIDTHS.value)
         case bytes() | bytearray() | memoryview():
             return f"{len(value)} bytes"
         case np.ndarray():
@@ -110,13 +124,13 @@ def shown(value: Any, depth: int = 3) -> str:
         case Mapping() | Sequence() | AbstractSet():
             if depth == 0:
                 return f"{type(value).__name__} of {len(value)}"
-            first = list(islice(value, _ITEMS))
+            first = list(islice(value, WIDTHS.items))
             texts, ends = [shown(item, depth - 1) for item in first], "[]" if isinstance(value, list) else "()"
             if isinstance(value, Mapping):
                 texts = [f"{key}: {shown(value[name], depth - 1)}" for key, name in zip(texts, first, strict=True)]
                 ends = "{}"
             single = "," if ends == "()" and len(value) == 1 else ""
-            return cut(f"{ends[0]}{', '.join([*texts, *_rest(len(value))])}{single}{ends[1]}", 2 * _VALUE)
+            return cut(f"{ends[0]}{', '.join([*texts, *_rest(len(value))])}{single}{ends[1]}", 2 * WIDTHS.value)
     if inspect.isroutine(value):
         return name_of(value)
     # What an object says of itself in one line, of ours the first; its class if that is nothing readable.
@@ -131,7 +145,7 @@ def shown(value: Any, depth: int = 3) -> str:
     if re.search(r" at 0x|\barray\(", text):  # an address in memory, or raw numbers, which tell a reader nothing
         return name_of(kind)
     is_ours = str(kind.__module__).partition(".")[0] == __name__.partition(".")[0]
-    return cut(line(text.partition("\n")[0] if is_ours else text, 4 * _VALUE), 2 * _VALUE)
+    return cut(line(text.partition("\n")[0] if is_ours else text, 4 * WIDTHS.value), 2 * WIDTHS.value)
 
 
 def number(value: Any) -> str:
@@ -143,7 +157,7 @@ def number(value: Any) -> str:
         text = f"{value:.4g}"
         return "0" if text == "-0" else text
     except (TypeError, ValueError):
-        return cut(str(value), _VALUE)
+        return cut(str(value), WIDTHS.value)
 
 
 def task_text(parameters: Mapping[str, Any]) -> str:
@@ -160,9 +174,9 @@ def task_text(parameters: Mapping[str, Any]) -> str:
 def array(values: Array) -> Shown:
     if values.ndim == 0:
         return Shown(shown(values.item()))
-    if values.ndim == 1 and values.size <= _ITEMS and values.dtype.kind in "biuf":
+    if values.ndim == 1 and values.size <= WIDTHS.items and values.dtype.kind in "biuf":
         return Shown(f"[{', '.join(map(shown, values.tolist()))}]")
-    if values.ndim == 2 and 0 < len(values) <= _ITEMS and values.dtype.kind in "iuf":
+    if values.ndim == 2 and 0 < len(values) <= WIDTHS.items and values.dtype.kind in "iuf":
         diagonal = np.diagonal(values)
         if diagonal.any() and values.shape[0] == values.shape[1] and np.array_equal(values, np.diag(diagonal)):
             return Shown(f"diag({', '.join(map(number, diagonal.tolist()))})")
@@ -180,7 +194,7 @@ def named(values: Mapping[str, Any], units: Mapping[str, str] | None = None) -> 
     """Return values by name with their units, such as ``goal=1.5 rad, offset=[0, 1] m``."""
     items = [
         f"{line(name, 60)}={shown(value)} {line((units or {}).get(name, ''), 60)}".rstrip()
-        for name, value in list(values.items())[:_ITEMS]
+        for name, value in list(values.items())[: WIDTHS.items]
     ]
     return Shown(", ".join([*items, *_rest(len(values))]))
 
@@ -194,11 +208,11 @@ def name_of(function: Any) -> Shown:
     if isinstance(function, partial):
         return Shown(f"partial({name_of(function.func)})")
     name = getattr(function, "__qualname__", None)
-    return Shown(line(name if isinstance(name, str) else type(function).__name__, _VALUE))
+    return Shown(line(name if isinstance(name, str) else type(function).__name__, WIDTHS.value))
 
 
 def _rest(count: int) -> list[str]:
-    return [f"... {count - _ITEMS} more"] if count > _ITEMS else []
+    return [f"... {count - WIDTHS.items} more"] if count > WIDTHS.items else []
 
 
 def table(title: str, rows: Iterable[tuple[str, object]]) -> str:

@@ -37,6 +37,8 @@ class Verdict:
     certificate: Certificate | None = None  #: the certificate that validates or does not suffice; None if there is none
     expected: Forecast | None = None  #: a forecast of further executions; None if nothing can be predicted
     rests_on: str | None = None  #: the evidence for a validation, its conditions, and what holds without; else None
+    remarks: tuple[str, ...] = ()  #: what the reason says beside the statement of a validation
+    conditions: tuple[str, ...] = ()  #: the conditions of a validation, each as the end of "It rests on ..."
     next_task: Mapping[str, Any] | None = None  #: the task to execute next, if learned dynamics choose it; else None
 
     @property
@@ -120,11 +122,15 @@ def judge_by(
     if not certificate.covers(tau, volume):
         why_not = sentences.undecided(certificate, tau, volume, quantities)
         return Verdict("undecided", tau, why_not, certificate=certificate, expected=certificate.expected)
-    conditions = (kind or by_name).rests_on(certificate, known.space)
-    rests_on = sentences.rests_on(conditions, certificate, tau, known, trials)
+    of_kind = (kind or by_name).rests_on(certificate, known.space)
+    conditions = sentences.all_conditions(of_kind, certificate, tau, known, trials)
+    rests_on = sentences.rests_on(conditions, certificate, tau, known)
     looked = sentences.looked(known, certificate, tau, trials, volume)
-    reason = f"{sentences.validated(certificate, tau, quantities).removesuffix('.')}{looked}."
-    return Verdict("validated", tau, reason, certificate=certificate, rests_on=rests_on)
+    reason = "; ".join([sentences.validated(certificate, tau, quantities).removesuffix("."), *looked])
+    tests = certificate.details.get("tests")
+    untested = ["no prediction was tested at drawn tasks"] if tests is not None and not tests["drawn"] else []
+    validated = Verdict("validated", tau, f"{reason}.", certificate=certificate, rests_on=rests_on)
+    return replace(validated, conditions=conditions, remarks=(*untested, *looked))
 
 
 @checked
@@ -147,13 +153,17 @@ def judge(
             verdict = judge_by(certificate, trials, threshold, volume=chosen.volume, provenance=known, kind=chosen.kind)
         except CertificateError as error:
             verdict = Verdict("undecided", float(threshold), str(error))
-    parts = [verdict.reason.removesuffix("."), verdict.expected, designs_sentence(trials)]
+    designs, remarks = designs_sentence(trials), list(verdict.remarks)
+    parts = [verdict.reason.removesuffix("."), verdict.expected, designs]
+    remarks += [] if designs is None else [designs]
     bets = bets_against(trials, float(threshold), quantile)
     if verdict.answer != "falsified" and bets is not None and bets.above:
         above = sentences.noise_may_explain(bets, float(threshold), known.quantities, chosen.confidence)
         parts.insert(0 if verdict.answer == "undecided" else len(parts), above)
-    reason = "; ".join(str(part) for part in parts if part is not None)
-    return replace(verdict, reason=f"{reason}.{sentences.caution(known, threshold)}")
+        remarks.append(above)
+    reason, caution = "; ".join(str(part) for part in parts if part is not None), sentences.caution(known, threshold)
+    remarks += [caution.strip().removesuffix(".")] if caution else []
+    return replace(verdict, reason=f"{reason}.{caution}", remarks=tuple(remarks))
 
 
 def _certified(

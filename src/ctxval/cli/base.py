@@ -7,6 +7,7 @@ import inspect
 import io
 import os
 import sys
+import textwrap
 import tomllib
 import traceback
 import warnings
@@ -32,6 +33,7 @@ from ctxval.campaign.goals_of_model import GoalWarning
 from ctxval.campaign.storage.disks import StoreWarning
 from ctxval.certificates import KINDS
 from ctxval.certificates.bounds import as_text
+from ctxval.certificates.sentences import summary
 from ctxval.cli.commands import TEXTS, Screen, app, line, number_parser
 from ctxval.core.experiment import UnitsWarning
 from ctxval.core.plan import DistanceWarning
@@ -371,8 +373,12 @@ def print_other_stores(others: list[str]) -> None:
 
 
 def print_verdict(verdict: Verdict, units: str = "") -> None:
-    threshold = f"{verdict.threshold:g} {units}".rstrip()
-    colour = COLOURS[verdict.answer]
-    out.say((verdict.answer.upper(), f"bold {colour}"), f" against {threshold}: {verdict.reason}", wrap=True)
-    if verdict.rests_on is not None:
-        out.say(verdict.rests_on, wrap=True)
+    """Print the answer with its numbers and conditions, on one screen; the report and --json have the whole reason."""
+    out.say((verdict.answer.upper(), f"bold {COLOURS[verdict.answer]}"), summary.headline(verdict, units), wrap=True)
+    print_table(summary.rows(verdict, units))
+    for remark in verdict.remarks if verdict.answer == "validated" else ():
+        out.say(f"Note: {remark}.", wrap=True)
+    if verdict.conditions:
+        out.say("It rests on")
+        for condition in verdict.conditions:
+            out.say(f"- {textwrap.shorten(condition, max(out.width - 2, 60), placeholder=' ...')}")

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from ctxval import Store, Trajectory, Trial
 from ctxval.campaign.storage.rows import COLUMNS, Side, checksum_of, follows, read_json, read_trial, row_of
 from ctxval.errors import ForeignStoreError, InputError
+from facts import refuses
 
 NAMES = [name.strip() for name in COLUMNS.split(",")]
 WHOLE = Trial(
@@ -158,7 +159,7 @@ def test_a_trial_follows_those_of_its_space() -> None:
 def test_json_is_json() -> None:
     assert read_json("[1, null]") == [1, None]
     assert np.isnan(read_json("NaN", finite=False))
-    with pytest.raises(InputError, match="NaN is not a number"):
+    with refuses(InputError, "NaN"):
         read_json("NaN")
 
 
@@ -205,7 +206,7 @@ def test_a_trajectory_in_memory_cannot_be_changed(tmp_path: Path) -> None:
     store = Store(tmp_path / "a.sqlite")
     add(store, 0, trajectory(0))
     found = store.trajectories([0], "system")[0]
-    with pytest.raises(ValueError, match="read-only"):
+    with refuses(ValueError):
         found.states[0] = 7.0
 
 
@@ -253,7 +254,7 @@ def test_a_row_that_was_repaired_is_read_again_and_a_damaged_one_is_refused(tmp_
     np.testing.assert_array_equal(store.trajectories([0, 1], "system")[0].states, trajectory(7).states)
     with other._transaction():
         other._execute(change, (npz, 1, 1))
-    with pytest.raises(ForeignStoreError, match="trial 1 cannot be read"):
+    with refuses(ForeignStoreError, 1, "a.sqlite"):
         store.trajectories([0, 1], "system")
 
 

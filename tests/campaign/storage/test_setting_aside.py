@@ -22,6 +22,7 @@ from ctxval.errors import ForeignStoreError
 from ctxval.models import Linear
 from ctxval.searches import Random
 from ctxval.systems import Simulated
+from facts import refuses
 
 SPACES = {
     "box": TaskSpace(goal=(0.5, 3.0, "m"), push=([0.0, -0.1], [0.4, 0.1])),
@@ -78,7 +79,7 @@ def test_a_damaged_trial_is_measured_again_and_nothing_is_deleted(tmp_path: Path
     before = executed(path, kind)
     damage(path, DAMAGES[name])
     row = stored_row(path)
-    with pytest.raises(ForeignStoreError, match="--set-aside 1"):
+    with refuses(ForeignStoreError, "--set-aside", 1):
         Store(path).trials()
     result = CliRunner().invoke(app, ["status", str(path), "--set-aside", "1", "--json"])
     assert result.exit_code == 0
@@ -111,7 +112,7 @@ def test_a_damaged_trajectory_is_taken_out_of_its_trial(tmp_path: Path, side: st
     before = executed(path)
     damage(path, "UPDATE trajectories SET npz = x'504b0506ff' WHERE trial = 1 AND side = ?", side)
     store = Store(path)
-    with pytest.raises(ForeignStoreError, match="--set-aside 1"):
+    with refuses(ForeignStoreError, "--set-aside", 1):
         store.trajectory(1, side)  # type: ignore[arg-type]
     set_aside(store, 1)
     assert store.trajectory(1, side) is None  # type: ignore[arg-type]

@@ -12,6 +12,7 @@ import pytest
 from ctxval import Store, Trajectory, Trial
 from ctxval.core.trial import Change
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
+from facts import refuses
 
 TRAJECTORY = Trajectory(np.arange(4.0), np.random.default_rng(0).normal(size=(4, 2)), np.ones((3, 1)))
 
@@ -61,7 +62,7 @@ def test_an_ended_trial_cannot_end_again() -> None:
     store = Store()
     store.add([(trial(), TRAJECTORY, None)])
     store.close_trials([(replace(trial(), state="failed", failure="x"), None)])
-    with pytest.raises(InputError, match="nothing more can be told"):
+    with refuses(InputError, 0):
         store.close_trials([(replace(trial(), state="completed", distance=1.0), TRAJECTORY)])
     assert store.trials()[0].state == "failed"
 
@@ -69,7 +70,7 @@ def test_an_ended_trial_cannot_end_again() -> None:
 def test_two_writers_of_one_trial_collide_with_a_clear_error(tmp_path: Path) -> None:
     first, second = Store(tmp_path / "a.sqlite"), Store(tmp_path / "a.sqlite")
     first.add([(trial(), TRAJECTORY, None)])
-    with pytest.raises(StoreAccessError, match="written by another process"):
+    with refuses(StoreAccessError, "a.sqlite", "trials.number"):
         second.add([(trial(), TRAJECTORY, None)])
     assert len(second.trials()) == 1
 
@@ -94,7 +95,7 @@ def test_a_foreign_database_is_refused_and_left_alone(tmp_path: Path) -> None:
         other.execute("CREATE TABLE photos (name TEXT)")
     other.close()
     before = path.read_bytes()
-    with pytest.raises(ForeignStoreError, match="not a ctxval store"):
+    with refuses(ForeignStoreError, "photos.sqlite"):
         Store(path)
     assert path.read_bytes() == before
 
@@ -102,7 +103,7 @@ def test_a_foreign_database_is_refused_and_left_alone(tmp_path: Path) -> None:
 def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "notes.txt"
     path.write_text("just some notes, long enough to be read as a page header by anyone who tries. " * 20)
-    with pytest.raises(ForeignStoreError, match="cannot be read"):
+    with refuses(ForeignStoreError, "notes.txt"):
         Store(path)
 
 
@@ -114,16 +115,16 @@ def test_another_schema_is_refused_in_one_sentence(tmp_path: Path, version: int,
         connection.execute("DROP TABLE history")
         connection.execute(f"PRAGMA user_version = {version}")
     before = path.read_bytes()
-    with pytest.raises(ForeignStoreError, match=f"has schema version {version} of {age} ctxval; this one reads only 8"):
+    with refuses(ForeignStoreError, 8, version, age):
         Store(path)
     assert path.read_bytes() == before
 
 
 def test_an_impossible_path_is_an_access_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreAccessError, match="cannot be used"):
+    with refuses(StoreAccessError, "a.sqlite"):
         Store(tmp_path / "file" / "a.sqlite")
-    with pytest.raises(StoreAccessError, match="there is no store"):
+    with refuses(StoreAccessError, "none.sqlite"):
         Store.existing(tmp_path / "none.sqlite")
 
 
@@ -133,7 +134,7 @@ def test_a_full_disk_loses_nothing_that_was_stored(tmp_path: Path) -> None:
     pages = store._execute("PRAGMA page_count").fetchone()[0]
     store._execute(f"PRAGMA max_page_count = {pages}")
     big = Trajectory(np.arange(5001.0), np.random.default_rng(1).normal(size=(5001, 4)), np.zeros((5000, 1)))
-    with pytest.raises(StoreAccessError, match="full"):
+    with refuses(StoreAccessError, "full", "a.sqlite"):
         store.add([(trial(1), big, None)])
     store.close()
     assert [t.number for t in Store(tmp_path / "a.sqlite").trials()] == [0]
@@ -151,13 +152,13 @@ def test_settings_come_back_and_the_last_ones_count(tmp_path: Path) -> None:
 
 def test_settings_that_are_too_long_are_neither_stored_nor_read(tmp_path: Path) -> None:
     store = Store(tmp_path / "a.sqlite")
-    with pytest.raises(InputError, match="name must have at most 16777216 characters as JSON"):
+    with refuses(InputError, 16777216, 16777218):
         store.keep_settings({"name": "0" * 2**24})
     assert store.settings() == {}
     with closing(sqlite3.connect(tmp_path / "a.sqlite")) as other, other:
         other.execute("INSERT INTO settings SELECT 'name', '\"' || hex(zeroblob(20000000)) || '\"'")
     tracemalloc.start()
-    with pytest.raises(ForeignStoreError, match="the settings in it cannot be read"):
+    with refuses(ForeignStoreError, "a.sqlite"):
         store.settings()
     assert tracemalloc.get_traced_memory()[1] < 2**24
     tracemalloc.stop()
@@ -200,5 +201,5 @@ def test_settings_must_be_texts_with_json_each_of_which_occurs_once(rows: list[t
     )  # without the constraints of a store, as in a damaged file
     for row in rows:
         store._execute("INSERT INTO temp.settings VALUES (?, ?)", row)
-    with pytest.raises(ForeignStoreError, match="the settings in it cannot be read"):
+    with refuses(ForeignStoreError, "settings"):
         store.settings()

@@ -18,6 +18,7 @@ from ctxval.cli.config.references import is_function, reference
 from ctxval.cli.config.settings import ExperimentSettings, read_settings
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError
+from facts import assert_names, refuses
 
 PARTS = """
 import functools
@@ -126,36 +127,34 @@ def test_a_reference_names_a_part_or_what_makes_it(kind: str, given: Any, expect
 
 
 @pytest.mark.parametrize(
-    ("kind", "given", "sentence"),
+    ("kind", "given", "facts"),
     [
-        ("system", "parts_here:Other", "must be a system, got the class parts_here.Other, which has no execute"),
-        ("system", {"type": "parts_here:Other", "args": "id > PWNED", "shell": True}, "which has no execute"),
-        ("system", "parts_here:other", "got an object of the class parts_here.Other, which has no execute"),
-        ("system", "parts_here:model", "which has no execute"),
-        ("system", "parts_here:step", "must be a system, got the function step"),
-        ("model", "parts_here:rig", "which has no step"),
-        ("model", "parts_here:steps", "must be a model, got the function steps"),
-        ("synthesizer", "parts_here:Rig", "which has no design"),
-        ("distance", "parts_here:Rig", "must be a function (model_trajectory, system_trajectory, task) -> d"),
-        ("distance", "parts_here:builtin", "got the builtin or method array"),
-        ("distance", "parts_here:absolute", "got an object of the class numpy.ufunc"),
-        ("distance", "parts_here:method", "got the builtin or method execute"),
-        ("distance", "parts_here:step", "must be a function (model_trajectory, system_trajectory, task)"),
-        ("system", {"type": "parts_here:rig", "speed": 1.0}, "is an object already, so it takes no arguments"),
-        ("system", {"type": "parts_here:method", "speed": 1.0}, "takes no arguments"),
+        ("system", "parts_here:Other", ("system", "parts_here.Other")),
+        ("system", {"type": "parts_here:Other", "args": "id > PWNED", "shell": True}, ()),
+        ("system", "parts_here:other", ("parts_here.Other",)),
+        ("system", "parts_here:model", ()),
+        ("system", "parts_here:step", ("system", "step")),
+        ("model", "parts_here:rig", ()),
+        ("model", "parts_here:steps", ("model", "steps")),
+        ("synthesizer", "parts_here:Rig", ()),
+        ("distance", "parts_here:Rig", ("model_trajectory", "system_trajectory")),
+        ("distance", "parts_here:builtin", ("builtin",)),
+        ("distance", "parts_here:absolute", ("numpy.ufunc",)),
+        ("distance", "parts_here:method", ("method",)),
+        ("distance", "parts_here:step", ("model_trajectory", "system_trajectory")),
+        ("system", {"type": "parts_here:rig", "speed": 1.0}, ()),
+        ("system", {"type": "parts_here:method", "speed": 1.0}, ()),
     ],
 )
-def test_what_is_no_part_is_refused_before_it_is_called(kind: str, given: Any, sentence: str) -> None:
+def test_what_is_no_part_is_refused_before_it_is_called(kind: str, given: Any, facts: tuple[object, ...]) -> None:
     with pytest.raises(InputError) as refused:
         part(kind, given)
-    assert sentence in str(refused.value)
+    assert_names(str(refused.value), *facts)
     assert calls() == []
 
 
 def test_what_a_function_makes_must_be_a_part_too() -> None:
-    with pytest.raises(
-        InputError, match=r"must be a system, got an object of the class builtins\.NoneType, which has no execute"
-    ):
+    with refuses(InputError, "system", "builtins.NoneType"):
         part("system", {"type": "parts_here:make_nothing", "speed": 1.0})
 
 
@@ -163,9 +162,9 @@ def test_what_a_function_makes_must_be_a_part_too() -> None:
 def test_pythons_own_library_has_no_parts(name: str) -> None:
     for kind in ("system", "model", "synthesizer", "distance"):
         for given in (name, {"type": name, "args": "id > PWNED", "shell": True}):
-            with pytest.raises(InputError, match="is in Python's standard library"):
+            with refuses(InputError):
                 part(kind, given)
-    with pytest.raises(InputError, match="is in Python's standard library"):
+    with refuses(InputError, name):
         argument({"ref": name})
 
 
@@ -173,14 +172,14 @@ def test_a_task_by_name_is_a_function_of_the_parameters() -> None:
     space = TaskSpace(goal=(0.0, 1.0))
     for name in ("task", "cached"):
         assert callable(task_function(f"parts_here:{name}", space, None))
-    for name, sentence in (
-        ("step", "must be a function p -> Task; it takes (x, u)"),
-        ("Rig", "must be a function p -> Task written in Python, got the class parts_here.Rig"),
-        ("builtin", "written in Python, got the builtin or method array"),
+    for name, facts in (
+        ("step", ()),
+        ("Rig", ("parts_here.Rig",)),
+        ("builtin", ("builtin",)),
     ):
         with pytest.raises(InputError) as refused:
             task_function(f"parts_here:{name}", space, None)
-        assert sentence in str(refused.value)
+        assert_names(str(refused.value), *facts)
     assert calls() == []
 
 
@@ -189,42 +188,42 @@ def test_functions_that_are_arguments_are_looked_at_too() -> None:
         assert isinstance(
             part("system", {"type": "Simulated", "step": {"ref": f"parts_here:{name}"}}), systems.Simulated
         )
-    for name, sentence in (
-        ("steps", "step of the system Simulated must be a function (x, u) -> x_next; it takes (x, u, t)"),
-        ("absolute", "step of the system Simulated must be a function (x, u) -> x_next written in Python"),
-        ("builtin", "must be an object, a class or a function written in Python"),
-        ("method", "must be an object, a class or a function written in Python"),
-        ("numpy", "must be an object, a class or a function written in Python"),
+    for name, facts in (
+        ("steps", ("step", "system", "Simulated", "x_next")),
+        ("absolute", ("step", "system", "Simulated", "x_next")),
+        ("builtin", ()),
+        ("method", ()),
+        ("numpy", ()),
     ):
         with pytest.raises(InputError) as refused:
             part("system", {"type": "Simulated", "step": {"ref": f"parts_here:{name}"}})
-        assert sentence in str(refused.value)
-    with pytest.raises(InputError, match="a function"):
+        assert_names(str(refused.value), *facts)
+    with refuses(InputError, "policy", "synthesizer"):
         part("synthesizer", {"type": "Policy", "policy": {"ref": "parts_here:step"}})
 
 
 def test_an_experiment_by_name_is_one_or_a_function_of_a_seed() -> None:
-    for name, sentence in (
+    for name, facts in (
         (
             "calls",
-            "must be an Experiment or a Validation, or a function that makes one, of a seed if it needs one, got list",
+            (),
         ),
-        ("Rig", "must be an Experiment or a Validation"),
-        ("builtin", "must be an Experiment or a Validation"),
-        ("steps", "must be callable with a seed and its options; it takes (x, u, t)"),
-        ("experiment", "parts_here:experiment cannot be made: ZeroDivisionError: inside"),
+        ("Rig", ()),
+        ("builtin", ()),
+        ("steps", ("options",)),
+        ("experiment", ("parts_here", "experiment", "ZeroDivisionError")),
     ):
         with pytest.raises(InputError) as refused:
             ExperimentSettings(experiment=f"parts_here:{name}").load()
-        assert sentence in str(refused.value)
-    with pytest.raises(InputError, match=r"with a seed and its options length; it takes \(seed, size=1\)"):
+        assert_names(str(refused.value), *facts)
+    with refuses(InputError, "options", "length"):
         ExperimentSettings(experiment="parts_here:experiment", options={"length": 2}).load()
     assert calls() == []
 
 
 @pytest.mark.parametrize("text", ["parts_here", ":rig", "parts_here:", "", "a b:c", "..:x", "parts_here:none", "1:\0"])
 def test_a_text_that_names_nothing_is_a_sentence(text: str) -> None:
-    with pytest.raises(InputError, match=r"must be module:attr|cannot be loaded"):
+    with refuses(InputError, ""):
         reference(text)
 
 
@@ -294,15 +293,15 @@ def test_a_command_from_another_folder_finds_what_the_file_names(here: Path) -> 
 def test_modules_of_one_name_from_two_folders_are_not_mixed_up(here: Path) -> None:
     one, two = described(here / "one", "1.0"), described(here / "two", "2.0")
     assert step_of(load(one)) == 1.0
-    with pytest.raises(InputError, match=r"a module named 'step_here' is already in use, .*one.step_here\.py, and"):
+    with refuses(InputError, "step_here", "module"):
         load(two)
     assert step_of(load(one)) == 1.0
     (here / "two" / "step_here.py").unlink()
-    with pytest.raises(InputError, match="none of this name is in"):
+    with refuses(InputError, "step_here.py"):
         load(two)
     # nor is one found in the folder of the other
     sys.modules.pop("step_here")
-    with pytest.raises(InputError, match="no module named 'step_here' is in"):
+    with refuses(InputError, "step_here", "module"):
         load(two)
     three = described(here / "three", "3.0", module="helper_here")
     assert step_of(load(three)) == 3.0
@@ -314,7 +313,7 @@ def test_modules_that_modules_import_are_not_mixed_up_either(here: Path) -> None
         (here / folder / "helper_here.py").write_text(f"value = {folder!r}\n")
         (here / folder / f"{name}.py").write_text("from helper_here import value\n")
     assert reference("step_here:value", here / "one") == "one"
-    with pytest.raises(InputError, match="a module named 'helper_here' is already in use"):
+    with refuses(InputError, "helper_here", "parts_here"):
         reference("parts_here:value", here / "two")
     (here / "three").mkdir()
     (here / "three" / "parts_here.py").write_text("value = 'three'\n")
@@ -338,7 +337,7 @@ def test_a_module_called_like_one_of_python_is_found_where_it_is_meant(here: Pat
     assert reference("this:value", here) == 3
     sys.modules.pop("this")
     (here / "json.py").write_text("value = 3\n")
-    with pytest.raises(InputError, match="a module named 'json' is already in use"):
+    with refuses(InputError, "json", "__init__.py"):
         reference("json:value", here)
 
 
@@ -347,7 +346,7 @@ def test_installed_modules_and_those_of_pythonpath_are_found(here: Path, monkeyp
     (here / "helper_here.py").write_text("value = 7\n")
     sys.path.append(str(here))
     (here / "one").mkdir()
-    with pytest.raises(InputError, match="no module named 'helper_here'"):
+    with refuses(InputError, "helper_here", "file"):
         reference("helper_here:value", here / "one")
     monkeypatch.setenv("PYTHONPATH", str(here))
     assert reference("helper_here:value", here / "one") == 7
@@ -357,7 +356,7 @@ def test_files_are_sought_in_the_folder_unless_their_path_is_whole(here: Path) -
     described(here / "one", "1.0")
     assert len(recorded("run.csv", here / "one")) == 3
     assert len(recorded(str(here / "one" / "run.csv"), here)) == 3
-    with pytest.raises(InputError, match=r"run\.csv"):
+    with refuses(InputError, "run.csv"):
         recorded("run.csv", here)
     for kind, table in (
         ("model", {"type": "Onnx", "source": "none.onnx"}),
@@ -373,12 +372,10 @@ def test_files_are_sought_in_the_folder_unless_their_path_is_whole(here: Path) -
 def test_where_to_seek_is_no_setting_of_a_file(here: Path) -> None:
     for key in ("folder", "file"):
         Path("a.toml").write_text(f'experiment = "pendulum"\n{key} = "/"\n')
-        with pytest.raises(InputError, match=f"no setting is called '{key}'"):
+        with refuses(InputError, "a.toml", "file", key):
             read_settings("a.toml", {})
 
 
 def test_a_missing_file_says_how_to_begin(here: Path) -> None:
-    with pytest.raises(
-        InputError, match=r"there is no experiment file a b\.toml; `ctxval init 'a b\.toml'` writes an example"
-    ):
+    with refuses(InputError, "a b.toml"):
         read_settings("a b.toml", {})

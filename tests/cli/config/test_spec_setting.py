@@ -2,11 +2,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from ctxval.cli.config.settings import ExperimentSettings
 from ctxval.distances import MaximumDeviation, UnsafeMargin
 from ctxval.errors import InputError
+from facts import refuses
 
 SPEC = {"avoid": {"type": "Ball", "center": [1.0], "radius": 0.2}, "components": ["angle"]}
 
@@ -23,7 +22,7 @@ def test_a_named_experiment_may_be_judged_by_a_specification() -> None:
 
 
 def test_a_specification_that_is_missing_is_asked_for() -> None:
-    with pytest.raises(InputError, match=r"the experiment file has no table \[spec\]"):
+    with refuses(InputError, "experiment"):
         ExperimentSettings.model_validate({"experiment": "pendulum", "judge": "spec"}).load()
 
 
@@ -31,7 +30,7 @@ def test_the_margin_is_the_threshold() -> None:
     settings = ExperimentSettings.model_validate(
         {"experiment": "pendulum", "spec": SPEC, "judge": "spec", "threshold": 0.5}
     )
-    with pytest.raises(InputError, match=r"its margin is the threshold, got 0\.5"):
+    with refuses(InputError, 0.5, "threshold"):
         settings.load()
 
 

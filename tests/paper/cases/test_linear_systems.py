@@ -10,6 +10,7 @@ from scipy.signal import cont2discrete
 from ctxval import Campaign, TaskSpace, Truth, cases, systems
 from ctxval.errors import InputError, UnknownNameError
 from ctxval.paper.cases import linear
+from facts import refuses
 
 ALL = list(linear.DIMENSIONS)
 
@@ -135,12 +136,12 @@ def test_the_task_space_has_the_initial_and_the_final_state(dim: int) -> None:
 
 @pytest.mark.parametrize("dim", [0, 11, -1, 2.0, True, "4", None])
 def test_a_dimension_that_the_paper_has_not_is_refused(dim: object) -> None:
-    with pytest.raises(InputError, match="integer from 1 to 10"):
+    with refuses(InputError, 1, 10):
         linear.experiment(0, dim)  # type: ignore[arg-type]
 
 
 def test_an_unknown_option_is_refused_with_the_nearest() -> None:
-    with pytest.raises(UnknownNameError, match="did you mean 'dim'"):
+    with refuses(UnknownNameError, "dim", "linear"):
         cases.by_name("linear", dims=3)
 
 

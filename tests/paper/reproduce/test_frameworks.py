@@ -15,6 +15,7 @@ from ctxval.errors import ModelError
 from ctxval.paper.cases import pendulum
 from ctxval.paper.cases.pendulum import Pendulum
 from ctxval.paper.reproduce.frameworks import _Pair, frameworks, worst_open_loop
+from facts import refuses
 from rig_thorough import more
 
 
@@ -180,5 +181,5 @@ def test_a_model_without_any_error_has_no_distance() -> None:
 
 def test_systems_that_diverge_have_no_worst_open_loop() -> None:
     explosive = models.Function(lambda x, u: 1e200 * (x + u) ** 3, vectorized=True)
-    with pytest.raises(ModelError, match="no maximum"):
+    with refuses(ModelError, "M", "S"):
         worst_open_loop(explosive, STILL, Task([1.0, 1.0], horizon=5, dt=1.0), 1.0, FINAL, restarts=2)

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval import cases, searches
-from ctxval.paper.reproduce.jobs import DISCARDED, Job, Results, case_digest, distances_of, records, run_job
+from ctxval.paper.reproduce.frameworks import PAPER
+from ctxval.paper.reproduce.jobs import Job, Results, case_digest, distances_of, records, run_job
 from ctxval.paper.reproduce.study import running_estimate
 
 PROFILE = Job("profile", "pendulum", 0, budget=21)
@@ -96,4 +97,4 @@ def test_every_job_has_its_own_key() -> None:
 
 
 def test_sd_discards_the_papers_five() -> None:
-    assert searches.SamplingDiscarding().discard == DISCARDED == 5
+    assert searches.SamplingDiscarding().discard == PAPER.discarded

@@ -29,9 +29,10 @@ from ctxval import (
 )
 from ctxval.campaign.storage.store import Store
 from ctxval.core.plan import gives_inputs
-from ctxval.errors import InputError
+from ctxval.errors import InputError, UnknownNameError
 from ctxval.studies.comparison import CandidateResult, PairResult
 from ctxval.studies.comparison.candidates import TrialNote
+from facts import assert_names, refuses
 from rig_suites import COARSE
 from rig_suites import validation as suite_of
 
@@ -190,53 +191,53 @@ def test_a_comparison_that_is_stopped_continues_with_the_same_choices(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "facts"),
     [
-        (lambda: {"a": cart()}, "at least two candidates, got 1"),
-        (lambda: {"a": cart(), "b": cart(limit=3.0)}, "the same task spaces, but space"),
-        (lambda: {"a": cart(), "b": make_validation()}, "the same task spaces"),
-        (lambda: {"a": by_hand(), "b": by_hand()}, "on a system that people execute"),
-        (lambda: {"a": cart(), "b": 3}, "each value is a Validation or an Experiment or a Campaign, also 'b'"),
-        (lambda: [cart(), cart()], "must be a table of names"),
+        (lambda: {"a": cart()}, (1, "comparison")),
+        (lambda: {"a": cart(), "b": cart(limit=3.0)}, ("b", "space.goal[0]")),
+        (lambda: {"a": cart(), "b": make_validation()}, ("b", "space.goal[0]")),
+        (lambda: {"a": by_hand(), "b": by_hand()}, ()),
+        (lambda: {"a": cart(), "b": 3}, ("b", "candidates")),
+        (lambda: [cart(), cart()], ("candidates", "m")),
         (
             lambda: {"a": cart(), "b": cart().with_parts(labels=Labels(units="mm"))},
-            "must have the same unit, got 'm' and 'mm'",
+            ("mm", "b"),
         ),
     ],
 )
-def test_what_cannot_be_compared_is_refused(make: Callable[[], Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_what_cannot_be_compared_is_refused(make: Callable[[], Any], facts: tuple[object, ...]) -> None:
+    with refuses(InputError, *facts):
         compare(make())
 
 
 def test_another_system_is_refused() -> None:
     other = make_validation(system=systems.Simulated(lambda x, u: x, vectorized=True))
-    with pytest.raises(InputError, match="the same systems, but system"):
+    with refuses(InputError, "system", "b"):
         compare({"a": make_validation(), "b": other})
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "facts"),
     [
-        ({"question": "median"}, "no question is called 'median'; did you mean 'mean'"),
-        ({"budget": 0}, "budget must be a positive integer"),
-        ({"budget": 2.5}, "budget must be a positive integer"),
-        ({"seed": -1}, "seed must be an integer"),
-        ({"largest_possible": 0.0}, "largest_possible must be a positive number"),
-        ({"largest_possible": float("nan")}, "largest_possible must be a positive number"),
-        ({"confidence": 0.3}, "more often than right"),
-        ({"stochastic": True}, "question must be mean for a stochastic system, got 'both'"),
-        ({"stochastic": True, "question": "worst"}, "executed distances do not tell which d. is larger"),
+        ({"question": "median"}, ("question", "median", "mean")),
+        ({"budget": 0}, ("budget",)),
+        ({"budget": 2.5}, ("budget",)),
+        ({"seed": -1}, ("seed", -1)),
+        ({"largest_possible": 0.0}, ("largest_possible",)),
+        ({"largest_possible": float("nan")}, ("largest_possible",)),
+        ({"confidence": 0.3}, ("confidence", 0.3)),
+        ({"stochastic": True}, ("question", "stochastic", "both")),
+        ({"stochastic": True, "question": "worst"}, ("question", "stochastic")),
     ],
 )
-def test_values_that_cannot_be_used_are_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_values_that_cannot_be_used_are_refused(options: dict[str, Any], facts: tuple[object, ...]) -> None:
+    with refuses((InputError, UnknownNameError), *facts):
         compare({"a": cart(), "b": cart(10.0)}, **options)
 
 
 @pytest.mark.parametrize("question", ["mean", "both"])
 def test_a_distance_above_the_largest_possible_one_ends_the_comparison(tmp_path: Path, question: Any) -> None:
-    with pytest.raises(InputError, match=r"largest_possible is 0\.0001, but a distance of"):
+    with refuses(InputError, "largest_possible", 0.0001):
         compare({"a": cart(), "b": cart(10.0)}, question=question, budget=9, largest_possible=1e-4, stores=tmp_path)
     kept = [trial for name in "ab" for trial in Store(tmp_path / f"{name}.sqlite").trials()]
     assert max(trial.distance for trial in kept) > 1e-4
@@ -257,11 +258,10 @@ def test_a_failed_draw_leaves_the_expected_distance_open_unless_a_largest_one_is
     pair = {"gentle": broken(1.0), "stiff": broken(10.0)}
     open_ = compare(campaigns(**pair), question="mean", budget=12)
     assert not open_.decided
-    assert "has no distance, so the expected distance is not known" in open_.pairs[0].reason
     assert sum(one.failed for one in open_.candidates) >= 1
     stated = compare(campaigns(**pair), question="mean", budget=6, largest_possible=1.0)
     assert stated.executions == 6
-    assert any("no distance can exceed 1" in assumption for assumption in stated.assumptions)
+    assert_names(stated.assumptions, 1)
 
 
 def comparison() -> Comparison:
@@ -284,7 +284,7 @@ def comparison() -> Comparison:
 def test_a_ranking_groups_what_is_not_told_apart() -> None:
     found = comparison()
     assert found.ranking("worst") == (("gp",), ("fnn", "<b>|linear"))
-    assert found.ranking_text("worst") == "gp < fnn ? <b>|linear"
+    assert_names(found.ranking_text("worst"), "gp", "fnn")
     assert found.ranking("mean") == (("gp", "<b>|linear"), ("fnn",))
     assert not found.decided
     assert found.pair("mean", "fnn", "gp").smaller == "gp"
@@ -301,7 +301,7 @@ def test_a_result_is_json_and_markdown_whatever_the_names_are() -> None:
     text = found.to_markdown()
     assert "<b>" not in text
     assert r"\<b\>\|linear" in text
-    assert "| expected distance | gp | fnn | -0.02 | -0.03 to -0.01 | 9 |" in text
+    assert_names(text, "gp", "fnn", -0.02, -0.03)
     assert "| -0.02 | -0.03 to -0.01 |" in text  # of the smaller one minus the other one
     assert "&lt;b&gt;" in found._repr_html_()
 
@@ -343,5 +343,5 @@ def test_candidates_that_are_equal_are_not_told_apart_by_a_suite() -> None:
 
 
 def test_a_suite_has_no_expected_distance() -> None:
-    with pytest.raises(InputError, match="question must be worst for a suite"):
+    with refuses(InputError, "question", "mean"):
         compare({"one": suite(), "other": suite(drag=0.1)}, question="mean")

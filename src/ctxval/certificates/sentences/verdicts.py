@@ -163,19 +163,23 @@ def _gaps(resolution: Mapping[str, float], quantities: Quantities) -> str:
 # What a validation rests on
 
 
-def rests_on(
+def all_conditions(
     conditions: Sequence[str], certificate: Certificate, tau: float, known: Provenance, trials: Sequence[Trial]
-) -> str:
-    """Return the evidence of a validation, what it rests on, and what independent draws say without any of it."""
+) -> tuple[str, ...]:
+    """Return the conditions of a kind of certificate, and those of the campaign, each as an end of "It rests on"."""
     details, parts = certificate.details, list(conditions)
     made_good = details.get("failures", {}).get("made_good", [])
     if made_good:
         numbers = ", ".join(str(failure["trial"]) for failure in made_good)
         parts.append(f"your statement that the cause of the failure of trial {numbers} was removed permanently")
     parts += [f"your statement that {remark}" for remark in known.remarks if remark != REFINED]
-    parts += _not_selected(known, known.known_before(tau, trials), tau)
-    text = f"{_evidence(certificate, tau, known.quantities)}It rests on {'; on '.join(parts)}."
-    tests = details.get("tests", {})
+    return (*parts, *_not_selected(known, known.known_before(tau, trials), tau))
+
+
+def rests_on(conditions: Sequence[str], certificate: Certificate, tau: float, known: Provenance) -> str:
+    """Return the evidence of a validation, what it rests on, and what independent draws say without any of it."""
+    details, tests = certificate.details, certificate.details.get("tests", {})
+    text = f"{_evidence(certificate, tau, known.quantities)}It rests on {'; on '.join(conditions)}."
     if tests.get("share_missed") is None:
         return text
     what = of_tasks(certificate.distribution)
@@ -216,8 +220,9 @@ def _evidence(certificate: Certificate, tau: float, quantities: Quantities) -> s
         beside = " beside dry friction" if details.get("friction") else ""
         text += (
             " No tried task exceeds the threshold under a further error of M, beyond what was learned, of up to "
-            f"{_push(everywhere)} at every step, or of {_push(away)} where no record is near; the largest error of M"
-            f"{beside} in the records, which was learned, is {_rate(everywhere.state, everywhere.residual)}."
+            f"{push_in_words(everywhere)} at every step, or of {push_in_words(away)} where no record is near; the "
+            f"largest error of M{beside} in the records, which was learned, is "
+            f"{_rate(everywhere.state, everywhere.residual)}."
         )
     if (pocket := details.get("unvisited_region")) is not None:
         text += (
@@ -238,7 +243,8 @@ def tolerances(certificate: Certificate, tau: float) -> tuple[Tolerance, Toleran
     return distances.tolerance(tau), distances.tolerance(tau, away=True)
 
 
-def _push(tolerance: Tolerance) -> str:
+def push_in_words(tolerance: Tolerance) -> str:
+    """Return the size of a push with its state and unit."""
     finite = np.isfinite(tolerance.push)
     return _rate(tolerance.state, tolerance.push) if finite else "more than 8 times the largest residual"
 
@@ -284,7 +290,9 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
     return ["what its certificate assumes"]
 
 
-def looked(known: Provenance, certificate: Certificate, tau: float, trials: Sequence[Trial], volume: float) -> str:
+def looked(
+    known: Provenance, certificate: Certificate, tau: float, trials: Sequence[Trial], volume: float
+) -> list[str]:
     """Return that a threshold was stated after distances were known, and which smaller ones before it do not hold."""
     count = known.known_before(tau, trials)
     known_ones = "1 distance was" if count == 1 else f"{count} distances were"
@@ -299,7 +307,7 @@ def looked(known: Provenance, certificate: Certificate, tau: float, trials: Sequ
             limits = enumerated((known.quantities.of(f"{each:.6g}") for each in group), 5)
             word, were, are = ("threshold", "was", "is") if len(group) == 1 else ("thresholds", "were", "are")
             parts.append(f"the smaller {word} {limits}, which {were} stated before, {are} {how}")
-    return "".join(f"; {part}" for part in parts)
+    return parts
 
 
 def _not_selected(known: Provenance, count: int, tau: float) -> list[str]:

@@ -22,7 +22,24 @@ from ctxval.paper.cases import pendulum
 WHOLE, FINAL = WholeTrajectory(norm=np.inf), FinalState(norm=1)
 """The distance of OLDT and CCDT, and that of OLCD and CuSTOM."""
 
-PAPERS_GOAL = 0.04  #: the goal angle of the paper's Fig. 2, rad, where CCDT is largest in the paper.
+
+@dataclass(frozen=True)
+class PaperNumbers:
+    """What the paper states, and the sizes of its experiments."""
+
+    goal: float = 0.04  #: the goal angle of the paper's Fig. 2, rad, where CCDT is largest in the paper
+    discarded: int = 5  # the paper's k in sampling and discarding
+    random: int = 500  # executions of the passive searches
+    arm: int = 60  # executions of the active searches
+    car: int = 100
+    pendulum: int = 100
+    common: int = 5  # number of common first samples
+    near: float = 2.5  # per cent of d*: the paper says of SC that it is so near after 60 samples
+    tasks: int = 200  # random tasks that are simulated for Aspect 1
+    shown: int = 0  # the seed of figures that show a single trial
+
+
+PAPER = PaperNumbers()
 
 BOUND = pendulum.Settings().torque
 """Bound of the open-loop torques, N m. It is that of the training data, so that the model does not extrapolate.

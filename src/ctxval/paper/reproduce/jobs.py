@@ -28,7 +28,7 @@ from ctxval.distances import TrackingError
 from ctxval.gp.kernels import Matern
 from ctxval.gp.surrogate import fit_surrogate
 from ctxval.paper.cases import arm
-from ctxval.paper.reproduce.frameworks import PAPERS_GOAL, closed_loops, frameworks
+from ctxval.paper.reproduce.frameworks import PAPER, closed_loops, frameworks
 
 SEARCHES = ("gp", "searches")  #: the folders of the package that choose tasks from distances
 
@@ -77,8 +77,6 @@ def measured_with(results: Iterable[Mapping[str, Any]], folders: tuple[str, ...]
 
 Result = dict[str, Any]
 
-DISCARDED = 5  # the paper's k in sampling and discarding
-
 
 @dataclass(frozen=True)
 class Job:
@@ -124,8 +122,8 @@ def records(distances: Array) -> list[list[float]]:
     """Return ``[index, distance]`` of the distances among the six largest so far: all that SC and SD depend on."""
     largest, pairs = list[float](), []
     for index, distance in enumerate(distances.tolist()):
-        if distance > (largest[-1] if len(largest) > DISCARDED else -np.inf):
-            largest = sorted([*largest, distance], reverse=True)[: DISCARDED + 1]
+        if distance > (largest[-1] if len(largest) > PAPER.discarded else -np.inf):
+            largest = sorted([*largest, distance], reverse=True)[: PAPER.discarded + 1]
             pairs.append([index, distance])
     return pairs
 
@@ -170,10 +168,10 @@ def run_job(job: Job) -> Result:
         if job.kind == "aspects":
             return _aspects(job, validation)
         # How far the closed loops on M and on S go below the paper's goal, and how far they are apart.
-        model, system = closed_loops(validation, validation.task(validation.space.parameters([PAPERS_GOAL])))
+        model, system = closed_loops(validation, validation.task(validation.space.parameters([PAPER.goal])))
         loops = {"model": model, "system": system}
         gap = np.abs(system.states - model.states)
-        below = {f"{name}_undershoot": PAPERS_GOAL - float(loop.states[:, 0].min()) for name, loop in loops.items()}
+        below = {f"{name}_undershoot": PAPER.goal - float(loop.states[:, 0].min()) for name, loop in loops.items()}
         return {**below, "apart": float(gap.max()), "end": float(gap[-1].sum())}
 
 

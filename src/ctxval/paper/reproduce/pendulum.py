@@ -11,18 +11,13 @@ from ctxval import Trajectory, cases, plot
 from ctxval._util.arrays import Array
 from ctxval.gp.surrogate import fit_surrogate
 from ctxval.paper.reproduce import study
-from ctxval.paper.reproduce.frameworks import PAPERS_GOAL, closed_loops
+from ctxval.paper.reproduce.frameworks import PAPER, closed_loops
 from ctxval.paper.reproduce.jobs import INFORMED, Job, Results, distances_of
 from ctxval.paper.reproduce.study import TECHNIQUES, Claim, Columns, Scale, Study, agreement, ranged, spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-SHOWN = 0  # the seed of figures that show a single trial
-_BUDGET = 100
-_COMMON = 5  # number of common first samples
-_NEAR = 2.5  # per cent of d*: the paper says of SC that it is so near after 60 samples
 
 
 class FourFrameworks(Study):
@@ -39,7 +34,7 @@ class FourFrameworks(Study):
         return [Job("frameworks", "pendulum", seed, budget=scale.of(1001)) for seed in scale.seeds] + profiles
 
     def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
-        profile = results[self.jobs(scale)[SHOWN]]
+        profile = results[self.jobs(scale)[PAPER.shown]]
         goals = np.array(profile["goals"])
         for label, values, colour, line in (
             ("OLDT: open loop, trajectories", np.full(len(goals), profile["oldt"][0]), study.GREEN, "-."),
@@ -50,7 +45,7 @@ class FourFrameworks(Study):
             axes.semilogy(goals, np.maximum(values, 1e-3), color=colour, linestyle=line, linewidth=1.8, label=label)
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        profile = results[self.jobs(scale)[SHOWN]]
+        profile = results[self.jobs(scale)[PAPER.shown]]
         open_loops = {name: [profile[name][0]] * len(profile["goals"]) for name in ("oldt", "olcd")}
         return {"goal_rad": profile["goals"], **open_loops, "ccdt": profile["ccdt"], "custom": profile["custom"]}
 
@@ -69,9 +64,9 @@ class FourFrameworks(Study):
         yield _two_regions("the profile is asymmetric, and poor around pi/2 and -pi/2", profiles)
         yield _two_regions("... with this bias in the training data", of_half)
         yield Claim(
-            f"CCDT is largest near a goal of {PAPERS_GOAL} rad",
+            f"CCDT is largest near a goal of {PAPER.goal} rad",
             f"largest at {ranged(farthest, 2)} rad, where it is {ranged(ccdt, 2)}",
-            agreement(max(abs(goal - PAPERS_GOAL) for goal in farthest) < 0.1),
+            agreement(max(abs(goal - PAPER.goal) for goal in farthest) < 0.1),
         )
         yield Claim(
             "OLDT and OLCD are flat, and much higher than CCDT and CuSTOM",
@@ -124,13 +119,13 @@ class Trajectories(Study):
         return [Job("loops", "pendulum", seed) for seed in scale.seeds]
 
     def _loops(self) -> tuple[Trajectory, Trajectory]:
-        validation = cases.by_name("pendulum", SHOWN).validation
-        return closed_loops(validation, validation.task(validation.space.parameters([PAPERS_GOAL])))
+        validation = cases.by_name("pendulum", PAPER.shown).validation
+        return closed_loops(validation, validation.task(validation.space.parameters([PAPER.goal])))
 
     def draw(self, results: Results, scale: Scale) -> Figure:
         model, system = self._loops()
         figure = plot.trajectories(model, system, states=("angle [rad]", "rate [rad/s]"), inputs=("torque [N m]",))
-        figure.suptitle(f"goal {PAPERS_GOAL} rad", fontsize=10)
+        figure.suptitle(f"goal {PAPER.goal} rad", fontsize=10)
         return figure
 
     def data(self, results: Results, scale: Scale) -> Columns:
@@ -145,7 +140,7 @@ class Trajectories(Study):
         apart, end, model, system = ([trial[name] for trial in trials] for name in names)
         larger = sum(s > m + 0.01 for m, s in zip(model, system, strict=True))
         yield Claim(
-            f"at a goal of {PAPERS_GOAL} rad, M and S move differently but reach the same final state",
+            f"at a goal of {PAPER.goal} rad, M and S move differently but reach the same final state",
             f"they are {ranged(apart, 2)} apart on the way and {ranged(end, 3)} at the end",
             agreement(spread(end)[0] < 0.1 * spread(apart)[0], spread(end)[0] < spread(apart)[0]),
         )
@@ -174,7 +169,7 @@ class Techniques(Study):
         return [*searches, *truths, *FourFrameworks().jobs(scale)[: scale.trials]]
 
     def _job(self, search: str, seed: int) -> Job:
-        return Job("search", "pendulum", seed, search=search, budget=_BUDGET)
+        return Job("search", "pendulum", seed, search=search, budget=PAPER.pendulum)
 
     def errors(self, results: Results, scale: Scale, search: str) -> Array:
         """Return the errors in per cent, shape ``(trials, budget)``."""
@@ -194,7 +189,7 @@ class Techniques(Study):
         axes.set_ylim(1e-3, 110)
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        columns: Columns = {"executions": range(1, _BUDGET + 1)}
+        columns: Columns = {"executions": range(1, PAPER.pendulum + 1)}
         for search in TECHNIQUES:
             quartiles = np.percentile(self.errors(results, scale, search), [25, 50, 75], axis=0)
             names = (f"{search}_{part}_percent" for part in ("lower_quartile", "median", "upper_quartile"))
@@ -205,23 +200,25 @@ class Techniques(Study):
         names = (*TECHNIQUES, *INFORMED)
         errors = {name: self.errors(results, scale, name) for name in names}
         ucb, sc, sd = (np.median(errors[name], axis=0) for name in TECHNIQUES)
-        within = {name: [study.first(row <= 1.0) - _COMMON for row in errors[name]] for name in ("gp-ucb", *INFORMED)}
+        known = PAPER.common
+        within = {name: [study.first(row <= 1.0) - known for row in errors[name]] for name in ("gp-ucb", *INFORMED)}
         median = {name: spread(counts)[0] for name, counts in within.items()}
         beyond = {name: ranged(counts, 1).replace(".0", "") for name, counts in within.items()}
-        near = study.first(sc <= _NEAR)
+        near = study.first(sc <= PAPER.near)
         as_near = int((errors["random"][:, -1] <= ucb[19]).sum())
         profiles = [results[job]["custom"] for job in FourFrameworks().jobs(scale)[: scale.trials]]
-        broad = 100 * np.median([np.mean(np.array(d) >= (1 - _NEAR / 100) * max(d)) for d in profiles])
+        broad = 100 * np.median([np.mean(np.array(d) >= (1 - PAPER.near / 100) * max(d)) for d in profiles])
         yield Claim(
             "CuSTOM is within 1 % after 3 samples beyond five common first ones, and at 0 % by 20",
             f"within 1 % after {beyond['gp-ucb']} beyond the five; median error at 20: {ucb[19]:.4f} %",
             agreement(median["gp-ucb"] <= 3 and ucb[19] < 0.05, median["gp-ucb"] <= 3 or ucb[19] < 0.05),
         )
         yield Claim(
-            f"SC is within {_NEAR} % only after 60 samples",
-            f"within {_NEAR} % after {near:g}; median error {sc[19]:.2f} % at 20, {sc[59]:.2f} % at 60",
-            agreement(30 <= near <= 90, near > median["gp-ucb"] + _COMMON),
-            f"random samples fall near a broad maximum sooner: {broad:.1f} % of the goals are within {_NEAR} % of d*",
+            f"SC is within {PAPER.near} % only after 60 samples",
+            f"within {PAPER.near} % after {near:g}; median error {sc[19]:.2f} % at 20, {sc[59]:.2f} % at 60",
+            agreement(30 <= near <= 90, near > median["gp-ucb"] + PAPER.common),
+            f"random samples fall near a broad maximum sooner: {broad:.1f} % of the goals are within "
+            f"{PAPER.near} % of d*",
         )
         yield Claim(
             "SC does not find the maximum even in 100 samples",
@@ -229,9 +226,9 @@ class Techniques(Study):
             agreement(sc[99] > ucb[19]),
         )
         yield Claim(
-            f"SD is not close even after 100 samples (the paper calls SC close from {_NEAR} % on)",
+            f"SD is not close even after 100 samples (the paper calls SC close from {PAPER.near} % on)",
             f"median error {sd[59]:.1f} % at 60, {sd[99]:.1f} % at 100",
-            agreement(sd[99] > _NEAR, sd[59] > _NEAR),
+            agreement(sd[99] > PAPER.near, sd[59] > PAPER.near),
             "the sixth largest of 100 samples is near a broad maximum too",
         )
         yield Claim(
@@ -262,8 +259,8 @@ class ConvergedGP(Study):
     axes = "goal angle [rad]", "distance [rad]"
     legend = 3
 
-    campaign = Job("search", "pendulum", SHOWN, search="gp-ucb", budget=25)
-    curve = Job("profile", "pendulum", SHOWN, budget=801)
+    campaign = Job("search", "pendulum", PAPER.shown, search="gp-ucb", budget=25)
+    curve = Job("profile", "pendulum", PAPER.shown, budget=801)
 
     def jobs(self, scale: Scale) -> list[Job]:
         return [self.campaign, self.curve]
@@ -285,7 +282,7 @@ class ConvergedGP(Study):
 
     def data(self, results: Results, scale: Scale) -> Columns:
         trials, curve = results[self.campaign], results[self.curve]
-        space = cases.by_name("pendulum", SHOWN).validation.space
+        space = cases.by_name("pendulum", PAPER.shown).validation.space
         surrogate = fit_surrogate(space.to_unit(np.array(trials["points"])), np.array(trials["distances"]))
         mean, deviation = surrogate.predict(space.to_unit(np.array(curve["points"])[:, None]))
         known = {"goal_rad": curve["points"], "true_distance": curve["distances"]}

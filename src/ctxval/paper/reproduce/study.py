@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask
-from ctxval.paper.reproduce.jobs import DISCARDED, Job, Results, distances_of
+from ctxval.paper.reproduce.frameworks import PAPER
+from ctxval.paper.reproduce.jobs import Job, Results, distances_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -174,7 +175,7 @@ def draw_quartiles(axes: Axes, rows: dict[str, Array]) -> None:
 
 def running_estimate(distances: Sequence[float] | Array, search: str) -> Array:
     """Return the largest distance, or the largest that SD keeps, after 1, 2, ... executions; NaN until there is one."""
-    discard, largest = DISCARDED if search == "sampling-discarding" else 0, list[float]()
+    discard, largest = PAPER.discarded if search == "sampling-discarding" else 0, list[float]()
     estimates = np.full(len(distances), np.nan)
     for k, distance in enumerate(distances):
         if not np.isnan(distance):

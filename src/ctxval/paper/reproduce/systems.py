@@ -11,14 +11,13 @@ from ctxval._util.arrays import Array
 from ctxval.core.soundness import MISSED
 from ctxval.paper.cases import arm, dubins
 from ctxval.paper.reproduce import study
+from ctxval.paper.reproduce.frameworks import PAPER
 from ctxval.paper.reproduce.jobs import Job, Result, Results, distances_of
 from ctxval.paper.reproduce.study import TECHNIQUES, Claim, Columns, ExecutionsWithin, Scale, Study, agreement, spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_RANDOM = 500  # executions of the passive searches
-_ARM, _CAR = 60, 100  # executions of the active searches
 
 # The paper's three models: label, colour, line, marker.
 MODELS = {
@@ -40,7 +39,7 @@ class ArmSamples(ExecutionsWithin):
     dodge = 0.3
 
     def budget(self, search: str, scale: Scale) -> int:
-        return _ARM if search == "gp-ucb" else _RANDOM
+        return PAPER.arm if search == "gp-ucb" else PAPER.random
 
     def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
         super().fill(axes, results, scale)
@@ -48,10 +47,10 @@ class ArmSamples(ExecutionsWithin):
 
     def claims(self, results: Results, scale: Scale) -> Iterator[Claim]:
         ucb, sc = (spread(self.executions(results, scale, search)[-2]) for search in ("gp-ucb", "random"))  # 2 %
-        median, low, high = (study.counted(value, _ARM) for value in ucb)
+        median, low, high = (study.counted(value, PAPER.arm) for value in ucb)
         yield Claim(
             "CuSTOM is within 2 % of d* in under 50 executions, far ahead of the baselines",
-            f"median {median} (from {low} to {high}); SC {study.counted(sc[0], _RANDOM)}",
+            f"median {median} (from {low} to {high}); SC {study.counted(sc[0], PAPER.random)}",
             agreement(ucb[0] < 50 and sc[0] > ucb[0], sc[0] > ucb[0]),
             "the distance of the network, piecewise linear inside, has many kinks and narrow peaks; with the other "
             "two models it takes fewer",
@@ -67,7 +66,7 @@ class ArmModels(Study):
     axes = "executions of S", "largest distance found [m]"
 
     def _job(self, kind: str, model: str, seed: int) -> Job:
-        search, budget = {"search": ("gp-ucb", _ARM), "truth": ("", 0), "aspects": ("", 21)}[kind]
+        search, budget = {"search": ("gp-ucb", PAPER.arm), "truth": ("", 0), "aspects": ("", 21)}[kind]
         return Job(kind, "arm", seed, (("model", model),), search, budget)
 
     def jobs(self, scale: Scale) -> list[Job]:
@@ -108,7 +107,7 @@ class ArmModels(Study):
         yield Claim(
             "CuSTOM finds d* within a few samples for every model",
             "within 2 % after "
-            + ", ".join(f"{study.counted(spread(within[m])[0], _ARM)} ({MODELS[m][0]})" for m in MODELS),
+            + ", ".join(f"{study.counted(spread(within[m])[0], PAPER.arm)} ({MODELS[m][0]})" for m in MODELS),
             agreement(max(spread(row)[0] for row in within.values()) < 50, spread(within["gp"])[0] < 50),
         )
         yield _order("by d*, the distance between M and S", "the GP is the best model, the linear one the worst", worst)
@@ -135,9 +134,6 @@ def _order(measure: str, paper: str, values: dict[str, list[float]]) -> Claim:
     return Claim(paper, f"{measure}, best first: {listed}", agreement(best and worst, best or worst))
 
 
-_TASKS = 200  # random tasks that are simulated for Aspect 1
-
-
 class DubinsMedians(Study):
     """The paper's Fig. 5: the largest distance found, 1/H ||xi_S - xi_M||_2 as printed, against executions."""
 
@@ -147,7 +143,7 @@ class DubinsMedians(Study):
     axes = "executions of S", r"largest distance $\frac{1}{H}\|\xi_S - \xi_M\|_2$ [m, rad]"
 
     def _job(self, search: str, seed: int) -> Job:
-        return Job("search", "dubins", seed, search=search, budget=_CAR if search == "gp-ucb" else _RANDOM)
+        return Job("search", "dubins", seed, search=search, budget=PAPER.car if search == "gp-ucb" else PAPER.random)
 
     def jobs(self, scale: Scale) -> list[Job]:
         seeds = scale.seeds
@@ -155,7 +151,7 @@ class DubinsMedians(Study):
         return searches + [job for seed in seeds for job in (Job("truth", "dubins", seed), self._aspects(seed))]
 
     def _aspects(self, seed: int) -> Job:
-        return Job("aspects", "dubins", seed, budget=_TASKS)
+        return Job("aspects", "dubins", seed, budget=PAPER.tasks)
 
     def estimates(self, results: Results, scale: Scale, search: str) -> Array:
         """Return the estimates of d*, shape ``(trials, budget)``."""
@@ -168,10 +164,11 @@ class DubinsMedians(Study):
         axes.axhline(float(best), color=study.BLACK, linewidth=1, linestyle="-.", label="best-known value (median)")
 
     def data(self, results: Results, scale: Scale) -> Columns:
-        columns: Columns = {"executions": range(1, _RANDOM + 1)}
+        columns: Columns = {"executions": range(1, PAPER.random + 1)}
         for search in TECHNIQUES:
             median = np.median(self.estimates(results, scale, search), axis=0)
-            columns[f"{search}_median"] = [*median.tolist(), *[""] * (_RANDOM - len(median))]  # empty after the budget
+            empty = [""] * (PAPER.random - len(median))  # after the budget
+            columns[f"{search}_median"] = [*median.tolist(), *empty]
         return columns
 
     def claims(self, results: Results, scale: Scale) -> Iterator[Claim]:
@@ -192,14 +189,14 @@ class DubinsMedians(Study):
         printed, square = (abs(factor * high - 3.5) < 0.5 and factor * low < 2 for factor in (1.0, root))
         yield Claim(
             "CuSTOM is at its maximum in 100 samples",
-            f"after {_CAR} executions GP-UCB is at {study.ranged(share, 0)} % of the best-known value",
+            f"after {PAPER.car} executions GP-UCB is at {study.ranged(share, 0)} % of the best-known value",
             agreement(spread(share)[0] > 95, spread(share)[0] > 80),
             "its maximum is not the maximum: a large search finds more",
         )
         yield Claim(
             "CuSTOM is above SC and SD even at 500 samples",
-            f"median {high:.4g} after {_CAR}, against SC {np.median(sc):.4g} and SD {np.median(sd):.4g} after "
-            f"{_RANDOM}; above both in {wins} of {scale.trials} trials",
+            f"median {high:.4g} after {PAPER.car}, against SC {np.median(sc):.4g} and SD {np.median(sd):.4g} after "
+            f"{PAPER.random}; above both in {wins} of {scale.trials} trials",
             agreement(high > low and wins > scale.trials / 2, high > low),
         )
         yield Claim(
@@ -217,7 +214,7 @@ class DubinsMedians(Study):
         yield Claim(
             "the model itself performs its tasks (Remark 1, Aspect 1)",
             f"the mean distance from the reference is {study.ranged(model, 2)} m on the model and "
-            f"{study.ranged(system, 2)} m on the system (median over {_TASKS} random tasks), against "
+            f"{study.ranged(system, 2)} m on the system (median over {PAPER.tasks} random tasks), against "
             f"{spread(size)[0]:.2f} m straight ahead",
             agreement(float(missed.max()) < MISSED, float(missed.min()) < MISSED),
             "the reference has the heading 0, which is not that of its waves, so that LQR trades one for the other",

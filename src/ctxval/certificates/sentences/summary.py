@@ -1,0 +1,50 @@
+"""A verdict on one screen: a headline, rows of numbers, and the conditions that a validation rests on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ctxval._util.representation import counted
+from ctxval.certificates.bounds import at_most, percent, with_error
+from ctxval.certificates.sentences.verdicts import push_in_words, tolerances
+
+if TYPE_CHECKING:
+    from ctxval.certificates.verdict import Verdict
+
+
+def headline(verdict: Verdict, units: str = "") -> str:
+    """Return the answer and its reason in one sentence; for a validation, the statement alone."""
+    threshold = f"{verdict.threshold:g} {units}".rstrip()
+    if verdict.answer != "validated" or verdict.certificate is None:
+        return f" against {threshold}: {verdict.reason}"
+    certificate = verdict.certificate
+    quantile, share = certificate.details.get("quantile"), certificate.volume
+    which = f"at least {100 * (1 - share):.4g} % of the tasks stay" if share else "every task stays"
+    executions = f" in at least {100 * quantile:g} % of its executions" if quantile else ""
+    if certificate.kind == "suite":
+        which = "every task of the suite was executed and stays"
+    return f": {which} at or below {threshold}{executions}."
+
+
+def rows(verdict: Verdict, units: str = "") -> dict[str, str]:
+    """Return the numbers of a validation by their names; empty for other verdicts, whose reason has them."""
+    certificate = verdict.certificate
+    if verdict.answer != "validated" or certificate is None:
+        return {}
+    details, tau, level = certificate.details, verdict.threshold, percent(certificate.confidence)
+    bound = f"{with_error(certificate.upper_bound, certificate.error)} {units}".rstrip()
+    shown = {"bound": f"{bound} ({certificate.kind}, {level})"}
+    if (best := details.get("best")) is not None:
+        largest = f"{best:.4g} {units}".rstrip()
+        shown["largest executed"] = f"{largest} in {counted(certificate.trials, 'execution')}"
+    tests = details.get("tests") or {}
+    if tests.get("drawn"):
+        shown["tests"] = f"{tests['drawn']} at drawn tasks"
+        if (error := tests.get("largest_error")) is not None:
+            shown["tests"] += f"; predictions erred by at most {at_most(100 * error / tau, 2)} % of the threshold"
+    if (pushes := tolerances(certificate, tau)) is not None:
+        shown["survives"] = f"a further error of M of {push_in_words(pushes[0])} at every step"
+    if (missed := tests.get("share_missed")) is not None:
+        what = "tasks" if details.get("quantile") is None else "executions"
+        shown["without assumptions"] = f"at most {at_most(100 * missed, 2)} % of the {what} exceed it ({level})"
+    return shown
