@@ -439,6 +439,8 @@ def main() -> None:
     parser.add_argument("--repeat", nargs=2, metavar=("FAMILY", "NUMBER"))
     parser.add_argument("--keep", type=Path, help="folder for the files of the input that is repeated")
     given = parser.parse_args()
+    # Commands of rigs name `python`: a version manager's script in its place reads its own files.
+    os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as place:
         base = prepare(Path(place) / "base")
         if given.repeat:

@@ -72,7 +72,7 @@ def decide(one: Run) -> dict[str, Any]:
     options = CertificateOptions(Dynamics())
     with single_threaded():
         campaign = Campaign(validation, seed=one.seed)
-        campaign.run(BUDGETS[one.group], threshold, certificate=options)
+        campaign.run(BUDGETS[one.group], threshold, certificate=options, thinking=float("inf"))
         verdict = campaign.verdict(threshold, certificate=options)
     return {
         "rule": RULE,

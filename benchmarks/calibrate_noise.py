@@ -83,7 +83,9 @@ def decide(run: tuple[str, str, int, float]) -> dict[str, Any]:
     largest = TRUTHS[name, imperfection]["distance"]
     started = time.process_time()
     with single_threaded():
-        campaign = Campaign(ALL[name](imperfection, seed + 1).validation, seed=seed).run(BUDGET, share * largest)
+        campaign = Campaign(ALL[name](imperfection, seed + 1).validation, seed=seed).run(
+            BUDGET, share * largest, thinking=np.inf
+        )
         verdict = campaign.verdict(share * largest)
     details = {} if verdict.certificate is None else verdict.certificate.details
     key = {"rule": RULE, "plant": name, "imperfection": imperfection, "seed": seed, "share": share}

@@ -86,7 +86,7 @@ def decide(run: tuple[str, str, int, float]) -> dict[str, Any]:
     largest, started = TRUTHS[name, imperfection]["distance"], time.process_time()
     with single_threaded():
         validation = without_rates(PLANTS[name], imperfection, seed + 1)
-        campaign = Campaign(validation, seed=seed).run(BUDGET, share * largest)
+        campaign = Campaign(validation, seed=seed).run(BUDGET, share * largest, thinking=np.inf)
         verdict = campaign.verdict(share * largest)
     kind = None if verdict.certificate is None else verdict.certificate.kind
     key = {"rule": RULE, "plant": name, "imperfection": imperfection, "seed": seed, "share": share}

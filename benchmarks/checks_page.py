@@ -16,14 +16,14 @@ def limit_of(check: Check) -> str:
     if check.stage == "bound":
         return "the threshold"
     value = getattr(LIMITS, check.limit) if isinstance(check.limit, str) else check.limit
-    return "none is open" if not value else f"{100 * value:g} %" if value < 0.6 else f"{value:g}"
+    return "0" if not value else f"{100 * value:g} %" if value < 0.6 else f"{value:g}"
 
 
 def table() -> str:
     """Return the rows, in the order in which checks withdraw the bound and choose tasks."""
-    rows = ["| check | about | limit | remedy | reason |", "|---|---|---|---|---|"]
+    rows = ["| check | about | limit | an execution closes it | reason |", "|---|---|---|---|---|"]
     for check in CHECKS:
-        remedy = "an execution" if check.remedy else ""
+        remedy = "yes" if check.remedy else ""
         rows.append(f"| `{check.code}` | {check.stage} | {limit_of(check)} | {remedy} | {check.reason} |")
     return "\n".join(rows) + "\n"
 

@@ -80,7 +80,7 @@ class JudgedRun:
         for name in ("screening", "evidence", "kept_evidence"):
             setattr(dynamics, name, watched(getattr(dynamics, name)))
         try:
-            self.campaign.run(budget, self.threshold)
+            self.campaign.run(budget, self.threshold, thinking=float("inf"))
         finally:
             for name in ("screening", "evidence", "kept_evidence"):
                 delattr(dynamics, name)

@@ -50,7 +50,7 @@ def typed(validation: Validation, task: dict[str, Any], moved: float = 0.0) -> f
 def decided(validation: Validation, threshold: float, seed: int) -> tuple[str, int]:
     """Return the verdict of a campaign that runs until it is decided, and its number of executions."""
     campaign = Campaign(validation, seed=seed)
-    campaign.run(BUDGET, threshold)
+    campaign.run(BUDGET, threshold, thinking=np.inf)
     return campaign.verdict(threshold).answer, campaign.executions
 
 

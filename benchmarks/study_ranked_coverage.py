@@ -96,7 +96,7 @@ def decide(run: tuple[str, int, float, bool]) -> dict[str, Any]:
     started, entry = time.process_time(), DEVELOPMENT[name]
     largest = truth(entry, seed)
     with single_threaded(), rule(ranked):
-        campaign = Campaign(entry(seed).validation, seed=seed).run(BUDGET, share * largest)
+        campaign = Campaign(entry(seed).validation, seed=seed).run(BUDGET, share * largest, thinking=np.inf)
         verdict = campaign.verdict(share * largest)
     return {
         "entry": name,

@@ -78,7 +78,9 @@ def decide(run: Run) -> dict[str, Any]:
     model, share, seed = run
     largest, started = float(all_distances(model).max()), time.process_time()
     with single_threaded():
-        campaign = Campaign(validation(model), seed=seed).run(len(servo.PATHS) * len(servo.GAINS), share * largest)
+        campaign = Campaign(validation(model), seed=seed).run(
+            len(servo.PATHS) * len(servo.GAINS), share * largest, thinking=np.inf
+        )
         verdict = campaign.verdict(share * largest)
     predictions = [campaign.recorder.dynamics.stored_prediction(trial) for trial in campaign.trials]
     return {

@@ -107,7 +107,7 @@ def decide(one: Run) -> dict[str, Any]:
     threshold, options = one.share * largest, CertificateOptions(Dynamics())
     with single_threaded():
         campaign = Campaign(parts, seed=one.seed)
-        campaign.run(BUDGET, threshold, certificate=options)
+        campaign.run(BUDGET, threshold, certificate=options, thinking=np.inf)
         verdict = campaign.verdict(threshold, certificate=options)
     bound = None if verdict.certificate is None else verdict.certificate.upper_bound / largest
     return {**asdict(one), "answer": verdict.answer, "executions": campaign.executions, "bound": bound}

@@ -40,7 +40,9 @@ def decide(run: tuple[str, int]) -> dict[str, Any]:
     largest, share = truth(entry, seed), FALSE if entry.misleading else TRUE
     options = CertificateOptions(Automatic(tests=0)) if entry.misleading else CertificateOptions()
     with single_threaded():
-        campaign = Campaign(entry(seed).validation, seed=seed).run(BUDGET, share * largest, certificate=options)
+        campaign = Campaign(entry(seed).validation, seed=seed).run(
+            BUDGET, share * largest, certificate=options, thinking=np.inf
+        )
         verdict = campaign.verdict(share * largest, certificate=options)
     details = {} if verdict.certificate is None else verdict.certificate.details
     return {

@@ -41,7 +41,7 @@ class Cell:
         store = folder / f"{name} {imperfection.replace('%', 'percent')}.sqlite"  # campaigns take longest
         experiment = watched.experiment(imperfection)
         self.campaign = Campaign(experiment.validation, store=store, seed=0)
-        self.campaign.run(BUDGET, self.threshold, progress=False)
+        self.campaign.run(BUDGET, self.threshold, thinking=np.inf, progress=False)
         self.watch: Watch | None = None
 
     def largest(self, payload: float) -> float:

@@ -27,6 +27,7 @@ import typer.main
 from hypothesis import settings
 
 from ctxval import Task, TaskSpace, Transitions, Validation, controllers, distances, models, systems
+from ctxval.campaign.thinking import CampaignThinking
 from ctxval.certificates import (
     CheckedPrediction,
     Evidence,
@@ -57,6 +58,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--manual", help="a folder with the built manual, whose pages are checked")
     parser.addoption("--kills", type=int, default=1, help="how many campaigns are killed and resumed")
     parser.addoption("--switches", type=int, default=1, help="how often two processes on one store are switched")
+
+
+@pytest.fixture(autouse=True)
+def _unlimited_thinking(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lift the default limit of thinking: no test may depend on the speed of the machine."""
+    limited = CampaignThinking.limited
+    monkeypatch.setattr(
+        CampaignThinking, "limited", lambda self, stated: limited(self, np.inf if stated is None else stated)
+    )
 
 
 TESTS = Path(__file__).parent

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 from ctxval.certificates import Forecast, Maxima, Sample, draw_maxima, forecast
+from ctxval.certificates.maxima import MaximaSettings
 from ctxval.gp.hyperposterior import draw_paths
 from ctxval.learning.actuators import ActuatorSettings
 from ctxval.learning.dynamics_posterior import PosteriorSettings
@@ -41,7 +42,9 @@ def take_few_draws(replace: Callable[[str, Any], None], *, once: bool = False) -
     for module in ("stopping", "posterior", "maxima"):
         replace(f"ctxval.certificates.{module}.draw_maxima", remembered if once else fewer)
     replace("ctxval.certificates.maxima.draw_paths", partial(draw_paths, waves=64))
-    replace("ctxval.certificates.maxima._MOST", 1)  # the draws are not doubled where a bound is near the threshold
+    replace(
+        "ctxval.certificates.maxima.MAXIMA", MaximaSettings(chains=1)
+    )  # the draws are not doubled where a bound is near the threshold
 
 
 def run_few_loops(replace: Callable[[str, Any], None]) -> None:

@@ -6,13 +6,14 @@ import ast
 import functools
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-from source_counts import numeric_constants
+from source_counts import counts_of_tests, numeric_constants, sentence_assertions
 
 SOURCE = Path(__file__).parents[1] / "src" / "ctxval"
 ARCHITECTURE = Path(__file__).parents[1] / "docs" / "architecture.md"
@@ -32,7 +33,9 @@ CONTROL = {
         "experiment",
     )
 }
-CONSTANTS = 157  # numbers in capitals that are no settings: tolerances of rounding, formats, layouts; never more
+SENTENCES = 80
+"""Assertions on wording: texts have their snapshots, everything else asserts names, values and codes."""
+CONSTANTS = 120  # numbers in capitals that are no settings: tolerances of rounding, formats, layouts; never more
 READ_ONLY = ("campaign.plot", "report")
 EXECUTING = {"execute", "run", "ask", "tell", "outcome", "distances", "plan"}
 
@@ -47,11 +50,11 @@ def modules() -> dict[str, Path]:
 
 
 @functools.cache
-def imports_of(path: Path) -> set[str]:
-    """Return the ctxval modules that a file imports when it is loaded or later; typing-only imports count too."""
-    known = modules()
+def imports_of(path: Path, *, loaded: bool = False) -> set[str]:
+    """Return the ctxval modules that a file imports; with ``loaded``, those that are loaded with it."""
+    known, tree = modules(), ast.parse(path.read_text())
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in tree.body if loaded else ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "ctxval":
             inside = node.module.removeprefix("ctxval").lstrip(".")
             for alias in node.names:
@@ -92,6 +95,11 @@ def test_a_folder_imports_only_from_lower_floors() -> None:
             # The public face hands out what the rooms up to the campaign have.
             own, other = room(module), room(imported) or "campaign"
             assert own == other or table[other] < table[own], f"{module} imports {imported}"
+
+
+def test_no_file_imports_itself_through_others() -> None:
+    graph = {name: imports_of(path, loaded=True) & {*MODULES} - {name} for name, path in modules().items()}
+    assert len(tuple(TopologicalSorter(graph).static_order())) >= len(graph)  # a CycleError names a circle
 
 
 @pytest.mark.parametrize("module", [name for name in MODULES if room(name) in NUMBERS_ONLY])
@@ -158,6 +166,23 @@ def test_tasks_validations_and_stores_are_there_without_the_parts_of_scipy() -> 
 
 def test_numbers_that_decide_are_settings() -> None:
     assert sum(len(numeric_constants(path.read_text())) for path in SOURCE.rglob("*.py")) <= CONSTANTS
+
+
+def test_tests_assert_facts_and_hardly_any_sentence() -> None:
+    assert counts_of_tests(Path(__file__).parent)["assertions on sentences"] <= SENTENCES
+
+
+def test_a_sentence_counts_wherever_a_test_compares_it_and_names_do_not() -> None:
+    text = """
+@pytest.mark.parametrize(("x", "words"), [(1, "it has no end"), (2, "a.csv: x[0]")])
+def test(x, words):
+    assert words in str(x)
+    assert "two words" in f("not an operand of it")
+    with pytest.raises(ValueError, match="must be a number"):
+        refuses(InputError, "dt", -0.1, "the step of time")
+    assert x == "--option of a.toml", "what is wrong with it"
+"""
+    assert [line for line, _ in sentence_assertions(text)] == [2, 6, 7]
 
 
 def test_numbers_tuples_and_arrays_are_constants_and_fields_of_settings_are_not() -> None:

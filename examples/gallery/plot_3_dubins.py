@@ -11,7 +11,7 @@ from matplotlib import pyplot
 from ctxval import Campaign, cases, plot, searches
 
 experiment = cases.by_name("dubins", seed=0)
-campaign = Campaign(experiment.validation, search=searches.Auto(thinking=100), seed=0).run(10, explore=True)
+campaign = Campaign(experiment.validation, search=searches.Auto(thinking="fast"), seed=0).run(10, explore=True)
 print(campaign.worst.parameters, campaign.worst.distance)
 
 # %%

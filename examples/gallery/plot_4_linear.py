@@ -11,7 +11,7 @@ from matplotlib import pyplot
 from ctxval import Campaign, cases, plot, searches
 
 experiment = cases.by_name("linear", seed=0, dim=10)
-campaign = Campaign(experiment.validation, search=searches.Auto(thinking=200), seed=0).run(15, explore=True)
+campaign = Campaign(experiment.validation, search=searches.Auto(thinking="fast"), seed=0).run(15, explore=True)
 truth = experiment.truth()
 print(f"largest distance found {campaign.worst.distance:.4f}, d* = {truth.distance:.4f}")
 

@@ -103,7 +103,8 @@ def test_edits_that_compute_something_else_are_noticed(
     written: Callable[[str], ModuleType], name: str, old: str, new: str
 ) -> None:
     found = difference(written(BEFORE), written(BEFORE.replace(old, new)), name)
-    assert found == "the source of it has changed"
+    assert found is not None
+    assert "source" in found
 
 
 def test_definitions_in_other_modules_are_reached(written: Callable[[str], ModuleType]) -> None:

@@ -207,6 +207,8 @@ def test_units_that_do_not_measure_the_same_are_refused(recorded: str, wanted: s
         ("rate_deg_s", "rate", "deg/s"),
         ("a_m_per_s2", "a", "m/s^2"),
         ("t_ms", "t", "ms"),
+        ("t__ms_", "t", "ms"),
+        ("t__ms", "t", "ms"),
         ("x[2]", "x[2]", ""),
         ("x_min", "x_min", ""),
         ("state", "state", ""),

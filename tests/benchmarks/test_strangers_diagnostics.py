@@ -13,6 +13,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from rig_evidence import GOOD, prediction
 from strangers_diagnostics import FAILED, JudgedRun, caught, stopping
 
+UNTESTED = "largest distance untested"
+
 
 def test_nothing_is_stopped_that_is_not_below_the_threshold() -> None:
     assert stopping(GOOD, 0.8, 2.0) == []
@@ -48,11 +50,11 @@ def test_the_last_judgement_after_each_execution_counts() -> None:
 
     campaign: Any = SimpleNamespace(recorder=SimpleNamespace(dynamics=dynamics), executions=0, run=run)
     assert JudgedRun(campaign, 2.0).run(5) == [
-        [0, ["fewest executions", "largest distance untested"]],
-        [1, ["fewest executions", "largest distance untested"]],
-        [2, ["fewest executions", "largest distance untested"]],
-        [3, ["largest distance untested"]],
-        [4, ["largest distance untested"]],
+        [0, ["fewest executions", UNTESTED]],
+        [1, ["fewest executions", UNTESTED]],
+        [2, ["fewest executions", UNTESTED]],
+        [3, [UNTESTED]],
+        [4, [UNTESTED]],
     ]
     assert not vars(dynamics)  # nothing is watched any more
 

@@ -53,7 +53,7 @@ def test_if_both_end_the_distance_is_that_of_the_common_part(tmp_path: Path) -> 
     assert again.run(6, explore=True).executions == 6
     points = campaign.trials.points(1)
     np.testing.assert_allclose(parts.distances(points), campaign.trials.distances)
-    assert "ended early on M and S" in str(again.verdict(1.0).to_json()) or again.verdict(1e-4).answer == "falsified"
+    assert again.verdict(1e-4).answer == "falsified"
 
 
 @pytest.mark.usefixtures("without_costs")
@@ -94,7 +94,7 @@ def test_a_model_that_ends_alone_is_a_question_of_the_model() -> None:
     assert campaign.verdict(1.0).answer == "undecided"
 
 
-@pytest.mark.parametrize("ended", ["stopped by the operator", "the environment truncated the episode at step 3"])
+@pytest.mark.parametrize("ended", ["operator stop", "truncated"])
 def test_a_failure_is_no_outcome(ended: str) -> None:
     class Stopped(systems.Simulated):
         def execute(self, controller: Any, task: Task) -> Trajectory:

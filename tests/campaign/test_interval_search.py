@@ -45,11 +45,12 @@ from ctxval.certificates import (
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, hypercube_in, share_missed
-from ctxval.core.coverage import UnvisitedRegion
+from ctxval.core.coverage import UntestedRest, UnvisitedRegion
 from ctxval.errors import InputError
 from ctxval.learning import dynamics_study
 from ctxval.learning.dynamics_posterior import condition
 from ctxval.testing import FaultyRig
+from facts import assert_names, refuses
 from rig_thorough import more
 
 
@@ -71,7 +72,6 @@ def test_a_linear_system_is_validated_in_few_executions_by_a_bound_that_is_true(
     campaign = Campaign(validation).run(16, 1.1 * largest)
     verdict = campaign.verdict(1.1 * largest)
     assert verdict.answer == "validated"
-    assert "the dynamics bound is" in verdict.reason
     assert verdict.certificate is not None
     assert verdict.certificate.upper_bound >= largest * (1 - 1e-6)
     assert campaign.executions <= 16
@@ -230,9 +230,9 @@ def test_a_plain_run_is_certified_by_predictions_that_are_computed_afterwards() 
 
 def test_an_audit_of_a_planned_number_cannot_end_it() -> None:
     validation, _ = linear()
-    with pytest.raises(InputError, match="auto, dynamics, posterior, anytime and suite, got 'audit'"):
+    with refuses(InputError, "audit", "auto", "suite"):
         Campaign(validation).run(5, 1.0, certificate=CertificateOptions(Audit(), volume=0.1))
-    with pytest.raises(InputError, match="needs the volume"):
+    with refuses(InputError, "volume"):
         Campaign(validation).run(5, 1.0, certificate=CertificateOptions(AnytimeAudit()))
 
 
@@ -265,8 +265,7 @@ def test_eight_drawn_tasks_are_executed_before_a_model_is_validated(decided: Cam
     assert 0.38 < share < 0.6
     by_model = plain.verdict(1.1 * largest, certificate=untested)
     assert by_model.answer == "validated"
-    assert "No tried task exceeds the threshold under a further error of M" in str(by_model)
-    assert "must be predicted beforehand" in plain.verdict(1.1 * largest).reason
+    assert plain.verdict(1.1 * largest).answer == "undecided"
 
 
 @pytest.mark.slow
@@ -284,15 +283,15 @@ def test_after_many_executions_of_a_search_the_tests_alone_are_missing() -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("tests", "origin", "sentence"),
+    ("tests", "origin", "facts"),
     [
-        (8, "spread", "at most 39 % of the tasks exceed 1000 (8 tests drawn as a Latin hypercube)"),
-        (22, "iid", "at most 13 % of the tasks exceed 1000 (22 independent draws)"),
+        (8, "spread", ("39 %", 1000, 8)),
+        (22, "iid", ("13 %", 1000, 22)),
     ],
 )
 @pytest.mark.thorough
 def test_the_tests_bound_the_share_of_the_tasks_that_exceed_the_threshold(
-    tests: int, origin: str, sentence: str
+    tests: int, origin: str, facts: tuple[object, ...]
 ) -> None:
     options = CertificateOptions(Automatic(tests=tests))
     campaign = Campaign(linear()[0], seed=2).run(90, 1e3, certificate=options)
@@ -300,7 +299,7 @@ def test_the_tests_bound_the_share_of_the_tasks_that_exceed_the_threshold(
     verdict = campaign.verdict(1e3, certificate=options)
     assert verdict.answer == "validated"
     assert verdict.rests_on is not None
-    assert sentence in verdict.rests_on
+    assert_names(verdict.rests_on, *facts)
 
 
 @pytest.mark.slow
@@ -366,6 +365,9 @@ def test_what_is_executed_next_depends_on_what_stands_in_the_way() -> None:
     place = replace(covered, unvisited_region=UnvisitedRegion(0.3, {"x": 1.0, "y": 1.0}, {"x": 0.3, "y": 0.3}, tasks))
     assert asked(place, known, 2.0, best=0.2) == [0.2, 0.6]
     assert asked(place, np.array([[0.2, 0.6]]), 2.0, best=0.2) == [0.1, 0.7]
+    rest = UntestedRest(0.3, {"x": 0.5}, 0.6, 0.7, 3.0, 2.5, tasks)
+    assert asked(replace(tested, untested_rest=rest), known, 2.0, best=0.9) == [0.2, 0.6]
+    assert asked(replace(tested, untested_rest=rest), known, 2.5, best=0.9) == at_bound.tolist()
     # Every third execution explores, and no task is executed twice.
     assert asked(contested, np.tile(known, (2, 1)), 0.5) == farthest.tolist()
     assert asked(contested, np.array([[0.9, 0.9], [0.8, 0.8], [0.7, 0.7], farthest]), 2.0) == at_bound.tolist()
@@ -396,6 +398,10 @@ def test_friction_at_rest_is_tried_at_the_least_that_nears_the_limit() -> None:
     known = np.array([[0.9, 0.05], [0.05, 0.9], [0.5, 0.5]])
     assert asked(rubbing, known, 0.95, best=0.6) == least.tolist()
     assert asked(replace(rubbing, friction={}), known, 0.95, best=0.6) != least.tolist()
+    moved = CandidateFilter(at_untested_rest=lambda task: task[::-1])
+    point = next_task(replace(rubbing, best=0.6, threshold=0.95), known, moved)
+    assert point is not None
+    assert point.tolist() == least[::-1].tolist()
     # If friction is known, every third execution leads farthest from the records only while they leave gaps.
     gap = StateInputGap(0.0, ("x[0]",), {"x[0]": 0.0})
     covered = replace(rubbing, coverage=replace(rubbing.coverage, beyond=gap, marginal=gap, pair=gap))
@@ -505,7 +511,7 @@ def test_evidence_is_the_same_after_it_was_kept() -> None:
 
 
 def test_a_threshold_must_be_positive() -> None:
-    with pytest.raises(InputError, match="threshold"):
+    with refuses(InputError, "threshold"):
         Campaign(linear()[0]).run(5, -1.0)
 
 

@@ -16,7 +16,7 @@ from ctxval.campaign.telling import SuppliedResult
 from ctxval.core.trajectory import Trajectory
 from ctxval.data import LogMapping
 from ctxval.errors import InputError
-from facts import refuses
+from facts import assert_names, refuses
 from rig_logs import run, write_bag, write_bag1, write_mat, write_mcap_json, write_parquet
 from rig_thorough import more, some
 
@@ -155,6 +155,7 @@ def test_a_sentence_about_an_upload_has_nothing_of_the_file(name: str, content: 
         read(tmp_path / name)
     assert CANARY not in str(refused.value)
     assert "\x1b" not in str(refused.value)
+    assert_names(str(refused.value), "position [m]", "speed [m/s]", "force [N]")
 
 
 @pytest.mark.slow

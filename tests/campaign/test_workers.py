@@ -220,9 +220,8 @@ def test_a_killed_worker_is_replaced_and_its_execution_repeated(tmp_path: Path) 
 
 def test_an_execution_that_kills_every_worker_fails_in_the_end(tmp_path: Path) -> None:
     campaign = run_of(Deadly(tmp_path, kill=10**6), 2, workers=2, retries=1)
-    assert [trial.failure for trial in campaign.trials] == [
-        "the worker was lost 2 times, at last: the worker ended by signal 9"
-    ] * 2
+    for trial in campaign.trials:
+        assert_names(str(trial.failure), 2, 9)
     assert [trial.attempts for trial in campaign.trials] == [2, 2]
     assert campaign.executions == 2
 
@@ -379,7 +378,8 @@ def test_a_thread_that_hangs_is_given_up() -> None:
         campaign = Campaign(make_validation(system=Hanging()), search=searches.Random())
         campaign.run(2, executor=executor, timeout=0.2)
         release.set()
-    assert [trial.failure for trial in campaign.trials] == ["the execution did not end within 0.2 s"] * 2
+    for trial in campaign.trials:
+        assert_names(str(trial.failure), 0.2)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import logsumexp
 
 from ctxval._util.arrays import Array
-from ctxval.certificates.expiry import SCALES, KnownStatistics, ScaleBets, SlopeBets
+from ctxval.certificates.expiry import CHANGES, KnownStatistics, ScaleBets, SlopeBets
 
 
 def known(values: Array, freedom: float | None) -> KnownStatistics:
@@ -78,11 +78,11 @@ def test_one_run_is_no_proof_and_a_second_is_as_surprising() -> None:
     calm = first
     for _ in range(20):
         calm = calm.after(1.0)
-    assert np.exp(calm.products).sum() / len(SCALES) < 21  # what it is on average, if nothing has changed
+    assert np.exp(calm.products).sum() / len(CHANGES.scales) < 21  # what it is on average, if nothing has changed
 
 
 def test_a_change_back_to_normal_wins_nothing() -> None:
     bets = ScaleBets.before(np.random.default_rng(6).chisquare(4, 12) / 4, None)
     for _ in range(30):
         bets = bets.after(0.01)  # smaller than certified: the model predicts better than it did
-    assert np.exp(bets.products).sum() / len(SCALES) < 30
+    assert np.exp(bets.products).sum() / len(CHANGES.scales) < 30

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ctxval import TaskSpace
-from ctxval.certificates.envelope_shape import ENOUGH, MANY, MULTIPLES, Surfaces, TrustedRegion, regions_inside
+from ctxval.certificates.envelope_shape import SHAPE, Surfaces, TrustedRegion, regions_inside
 from facts import assert_names
 
 SPACE = TaskSpace(payload=(0.0, 2.0, "kg"), goal=(-1.0, 1.0, "m"), start=(-1.0, 1.0, "m"))
@@ -95,7 +95,7 @@ def test_what_is_left_out_is_what_the_others_interpolate() -> None:
         others = np.delete(np.arange(30), k)
         without = Surfaces.through(points[others], values[others], surfaces.scales).with_errors(0.0)(points[k])
         np.testing.assert_allclose(surfaces.left_out[k], without, atol=1e-6)
-        errors = np.abs(np.minimum(values[k], ENOUGH) - np.minimum(without, ENOUGH))
+        errors = np.abs(np.minimum(values[k], SHAPE.enough) - np.minimum(without, SHAPE.enough))
         np.testing.assert_allclose(surfaces.errors[k], errors, atol=1e-6)
 
 
@@ -125,15 +125,15 @@ def test_many_checks_show_that_errors_are_too_large() -> None:
     rng = np.random.default_rng(4)
     points, more = rng.random((150, 3)), rng.random((2000, 3))
     surfaces = Surfaces.through(points, bowl(points)[:, :1]).with_errors(10.0)
-    least = surfaces.with_errors(MULTIPLES[0])
-    checks = more[least(more)[:, 0] <= 1][:MANY]
+    least = surfaces.with_errors(SHAPE.multiples[0])
+    checks = more[least(more)[:, 0] <= 1][: SHAPE.many]
     outside = checks[bowl(checks)[:, 0] > 1]
     lowered = surfaces.without(outside, len(checks))
     assert lowered.errors.sum() < surfaces.errors.sum()
     true = bowl(more)[:, 0] > 1
     assert ((lowered(more)[:, 0] <= 1) & true).mean() < 0.01
     assert (surfaces(more)[:, 0] <= 1).mean() <= (lowered(more)[:, 0] <= 1).mean() <= 1 - true.mean() + 0.01
-    few = surfaces.without(outside[:0], MANY - 1)
+    few = surfaces.without(outside[:0], SHAPE.many - 1)
     np.testing.assert_allclose(few.errors, surfaces.errors)
 
 

@@ -6,13 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval.certificates.explained import (
-    CONTRADICTED,
     ExplainedExecution,
     evidence_against,
     least_explained,
     share_supported,
     support_of,
 )
+from ctxval.certificates.limits import LIMITS
 from ctxval.core.quantiles import LEVELS
 
 RUNS = 200
@@ -29,14 +29,14 @@ def executions(distances: list[float], p_values: np.ndarray | None = None) -> li
 def test_a_true_law_is_contradicted_seldom(count: int) -> None:
     rng = np.random.default_rng(count)
     drawn = [executions(rng.random(count).tolist(), rng.random((count, 3))) for _ in range(400)]
-    assert np.mean([evidence_against(each) > CONTRADICTED for each in drawn]) < 0.03
+    assert np.mean([evidence_against(each) > LIMITS.contradicted for each in drawn]) < 0.03
 
 
 def test_two_distances_that_noise_does_not_explain_contradict_it_among_many_that_it_does() -> None:
     usual = np.linspace(0.1, 0.9, 12).tolist()
-    assert evidence_against(executions([*usual, 1.5])) < CONTRADICTED
+    assert evidence_against(executions([*usual, 1.5])) < LIMITS.contradicted
     for order in ([1.5, 1.5, *usual], [1.5, *usual, 1.5], [*usual, 1.5, 1.5]):  # evidence does not expire
-        assert evidence_against(executions(order)) > CONTRADICTED
+        assert evidence_against(executions(order)) > LIMITS.contradicted
     least = least_explained(executions([*usual, 1.5]))
     assert least is not None
     assert (least.trial, least.p_value) == (12, pytest.approx(1 / (1 + RUNS)))

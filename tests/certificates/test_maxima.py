@@ -12,7 +12,7 @@ from ctxval.certificates import (
     draw_maxima,
     settle_maxima,
 )
-from ctxval.certificates.maxima import _MOST, MOST, representative
+from ctxval.certificates.maxima import MAXIMA, representative
 from ctxval.errors import CertificateError, InputError
 from ctxval.gp.hyperposterior import Prior
 from facts import assert_names, refuses
@@ -260,7 +260,7 @@ def test_near_the_threshold_more_is_drawn_but_not_for_ever(monkeypatch: pytest.M
     seeds, trials = counted(monkeypatch), sample(6)
     usual = quick(trials)
     found = settle_maxima(trials, usual.upper(0.9), 0.9)
-    assert 2 <= len(seeds) <= _MOST
+    assert 2 <= len(seeds) <= MAXIMA.chains
     assert len(set(seeds)) == len(seeds)
     assert len(found.draws) == len(seeds) * len(usual.draws)
     assert len(found.conditioned) == 10 * len(seeds)
@@ -273,12 +273,12 @@ def test_near_the_threshold_more_is_drawn_but_not_for_ever(monkeypatch: pytest.M
 
 
 def test_many_trials_are_represented_by_the_largest_and_well_spread_ones() -> None:
-    few, many = sample(MOST), sample(1000, 2)
-    assert len(representative(few)) == MOST
+    few, many = sample(MAXIMA.most), sample(1000, 2)
+    assert len(representative(few)) == MAXIMA.most
     kept = representative(many)
-    assert len(kept) == MOST
+    assert len(kept) == MAXIMA.most
     assert kept.best == many.best
-    assert set(np.sort(many.distances)[-MOST // 4 :]) <= set(kept.distances)
+    assert set(np.sort(many.distances)[-MAXIMA.most // 4 :]) <= set(kept.distances)
 
 
 @pytest.mark.thorough

@@ -137,6 +137,7 @@ def test_options_are_given_by_name_and_checked(tmp_path: Path, monkeypatch: pyte
     assert (found["details"]["discarded"], found["details"]["predictions"]) == (2, 50)
     refused = invoke("certify", "r.sqlite", "--kind", "region", "--option", "tests=3")
     assert refused.exit_code == 2
+    assert_names(refused.stderr, "tests", "auto", "dynamics")
 
 
 def test_code_of_another_user_is_asked_about_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

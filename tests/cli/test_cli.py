@@ -523,6 +523,7 @@ def test_a_run_names_what_its_verdict_rests_on_and_the_other_campaigns(invoke) -
     assert_names(other.stdout, 1, "gp-ucb-seed0.sqlite")
     report = json.loads(invoke(*arguments, "--json").stdout)
     assert report["other_stores"] == ["runs/short-gp-ucb-seed1.sqlite"]
+    assert report["rests_on"]
 
 
 @pytest.mark.slow

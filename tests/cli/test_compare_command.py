@@ -89,6 +89,7 @@ def test_two_files_are_compared_and_the_result_is_printed_and_written(invoke: In
 def test_candidates_have_names_and_cases_have_options(invoke: Invoke) -> None:
     same = invoke("gentle.toml", "other/gentle.toml")
     assert same.exit_code == 2
+    assert_names(same.stderr, "gentle")
     found = invoke("a=pendulum", "b=linear:dim=2", "--budget", "2")
     assert found.exit_code == 2
     assert_names(found.stderr, "b")

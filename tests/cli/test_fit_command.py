@@ -120,6 +120,7 @@ def test_batches_are_taken_if_they_are_promised(invoke: Invoke) -> None:
     options = ("--step", "my_batch_step:step", "--parameter", "gain=[0, 1]", "--vectorized", "--out", "a.toml")
     found = json.loads(invoke("logs", *options, "--json").stdout)["fitted"][0]
     assert found["kind"] == "parameters"
+    assert found["useless"]  # a cart is no integrator of the force
     assert "vectorized = true" in Path("a.toml").read_text()
 
 
@@ -132,7 +133,7 @@ def test_a_given_model_that_cannot_be_used_is_an_error(content: str | None, invo
     Path("given.xml").write_text(content or f"{slide}</mujoco>")
     result = invoke("logs", "--kind", "linear", "--given", "given.xml")
     assert result.exit_code in (2, 3), result.stdout + result.stderr
-    assert_names(" ".join(result.stderr.split()), *(["given.xml"] if content else [2, 1, 0, "qpos", "qvel"]))
+    assert_names(" ".join(result.stderr.split()), *(["MuJoCo"] if content else [2, 1, 0, "qpos", "qvel"]))
     assert not result.stdout
 
 
@@ -177,6 +178,7 @@ def test_a_model_that_is_no_better_than_none_is_said_to_be_useless(invoke: Invok
     assert_names(said, "linear")
     again = invoke("logs", "--kind", "linear", "--json")
     assert again.exit_code == 1
+    assert json.loads(again.stdout)["fitted"][0]["useless"]
 
 
 @pytest.mark.parametrize("name", ["model.npz", "model.onnx", "model.toml"])

@@ -251,6 +251,7 @@ def test_a_correction_of_a_function_cannot_be_onnx_and_is_refused_before_executi
     Path("cart.toml").write_text(described[:start] + table + described[end:])
     done = invoke("refine", "cart.toml", "--out", "better.onnx")
     assert done.exit_code == 2, done.stdout + done.stderr
+    assert_names(" ".join(done.stderr.split()), "ONNX")
     assert not any(Store(path).trials() for path in Path().rglob("*.sqlite"))
 
 

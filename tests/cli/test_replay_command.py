@@ -235,7 +235,7 @@ def test_a_replay_is_also_a_page(invoke: Invoke, tmp_path: Path) -> None:
     done = invoke("runs", *LINEAR, "--html", "out/page.html", "--json")
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["report"] == "out/page.html"
-    Path("out/page.html")
+    assert Path("out/page.html").exists()
     printed = invoke("runs", *LINEAR, "--html", "out/page.html")
     assert "report: out/page.html" in printed.output
     refused = invoke("runs", *LINEAR, "--html", "runs")

@@ -137,7 +137,8 @@ def test_the_next_command_has_the_options_of_the_campaign(folder: Path, invoke: 
 @pytest.mark.thorough
 def test_a_trajectory_with_its_task_and_recordings_without(folder: Path, invoke: Invoke) -> None:
     one = report(invoke("same0.csv", "--set", "goal=-1.5", "--json"))
-    [each["name"] for each in one["watch"]["channels"] if each["later"] != [None]]
+    names = [each["name"] for each in one["watch"]["channels"] if each["later"] != [None]]
+    assert any("distance" in name for name in names)
     result = invoke("heavier0.csv", "heavier1.csv", "heavier2.csv", "--json")
     assert result.exit_code == 1
     without = json.loads(result.stdout)

@@ -11,7 +11,7 @@ import pytest
 from conftest import make_validation
 from ctxval import Experiment, Task, TaskSpace, distances, systems
 from ctxval.core.experiment import UnitsWarning
-from facts import warns
+from facts import assert_names, warns
 
 LABELS = ("angle [rad]", "rate [rad/s]")
 
@@ -73,5 +73,6 @@ def test_a_parameter_that_is_taken_as_a_state_in_another_unit_is_doubted() -> No
     distance = distances.FinalState(components=[0])
     doubted = Experiment("x", _swing(1.0).with_parts(distance=distance), states=LABELS).doubt_of_parameters
     assert doubted is not None
+    assert_names(doubted, "lean", "deg", "angle", "rad")
     converted = Experiment("x", _swing(np.pi / 180).with_parts(distance=distance), states=LABELS)
     assert converted.doubt_of_parameters is None

@@ -434,8 +434,7 @@ def test_header_stamps_are_the_times_if_they_are_plausible(tmp_path: Path) -> No
     for name, late in (("late.mcap", jitter), ("wild.mcap", 30 * np.arange(21) % 7)):
         write_mcap_ros2(tmp_path / name, one, late=late)
         found = read_recordings([tmp_path / name], JOINTS, longest_gap=1e9)
-        clock = "their header stamps" if name[0] == "l" else "those at which they were logged"
-        assert_names(found.notes, "times", clock)
+        assert any("stamps" in note for note in found.notes) == (name[0] == "l")
     (log,) = read_logs([tmp_path / "late.mcap"])
     times = log.signals(["/joints.effort"], JOINTS.clock)["/joints.effort"].times
     np.testing.assert_allclose(times, one.times, atol=1e-9)
@@ -444,4 +443,4 @@ def test_header_stamps_are_the_times_if_they_are_plausible(tmp_path: Path) -> No
 def test_one_clock_is_used_for_all_topics(tmp_path: Path) -> None:
     write_mcap_json(tmp_path / "a.mcap", run(10))  # without stamps
     found = read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": ["/state.cart.position"]}))
-    assert found.notes[-1] == "the times of messages are those at which they were logged"
+    assert not any("stamps" in note for note in found.notes)

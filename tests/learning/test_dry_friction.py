@@ -73,13 +73,14 @@ def test_what_holds_a_joint_at_rest_is_bounded_by_what_it_withstood_and_what_set
         return sticky_step(x, acting, 0.0) - MODEL.step(x, acting)
 
     transitions = Transitions(x, inputs, step(x, inputs))
-    least, largest, passed, uneven = known.resting(transitions, missed)
+    least, largest, passed, uneven = known.resting(transitions, known.pushes(transitions, missed))
     assert (uneven == 1).all()
     # At another place, the joint withstands three times the force that moved it here.
     place = np.array([[0.8, 0.0]])
     at, pushes = np.concatenate([x, place]), np.concatenate([inputs, [[3.9]]])
     caught = Transitions(at, pushes, np.concatenate([transitions.x_next, place]))
-    ratios = known.resting(caught, lambda acting: sticky_step(at, acting, 0.0) - MODEL.step(at, acting))[3]
+    pushed = known.pushes(caught, lambda acting: sticky_step(at, acting, 0.0) - MODEL.step(at, acting))
+    ratios = known.resting(caught, pushed)[3]
     assert ratios[1, 0] == pytest.approx(3.9 / 2.0, rel=0.05)
     assert least[:, 0] == pytest.approx([1.1, GRIP], abs=0.01)
     assert largest[:, 0] == pytest.approx([1.3, 2.0], abs=0.02)
@@ -192,13 +193,15 @@ def test_a_joint_that_creeps_while_it_is_held_is_found_to_do_so() -> None:
     # A joint that moves faster than it could creep is not held.
     start, push = np.array([[0.3, 0.0]]), np.array([[0.95]])
     begun = np.concatenate([x, start]), np.concatenate([u[:, None], push])
-    least, *_ = friction.resting(Transitions(*begun, creeping(*begun)), lambda acting: np.zeros_like(begun[0]))
+    steps = Transitions(*begun, creeping(*begun))
+    least, *_ = friction.resting(steps, friction.pushes(steps, lambda acting: np.zeros_like(begun[0])))
     assert creeping(start, push)[0, 1] < 2 * 0.006 * 0.95
     assert least[:, 0] == pytest.approx(GRIP, rel=0.02)
     # A joint that begins to creep does not move yet.
     start, push = np.array([[0.3, 0.0]]), np.array([[2.0]])
     x, u = np.concatenate([x, start]), np.concatenate([u[:, None], push])
-    least, largest, *_ = friction.resting(Transitions(x, u, creeping(x, u)), lambda acting: np.zeros_like(x))
+    steps = Transitions(x, u, creeping(x, u))
+    least, largest, *_ = friction.resting(steps, friction.pushes(steps, lambda acting: np.zeros_like(x)))
     assert least[:, 0] == pytest.approx(GRIP, rel=0.02)
     assert largest[1, 0] == pytest.approx(2.0, rel=0.05)
 

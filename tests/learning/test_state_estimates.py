@@ -84,6 +84,7 @@ def test_a_campaign_decides_with_the_angle_alone(share: float, answer: str) -> N
     assert verdict.answer == answer
     if answer == "validated":
         assert largest <= verdict.bound <= share * largest
+        assert "outputs" in str(verdict)
 
 
 class Fragile:

@@ -103,6 +103,7 @@ def test_a_chart_draws_what_it_is_given_where_it_belongs() -> None:
     assert "threshold 0.7" in found
     assert "<title>trial 3</title>" in found
     assert "goal [rad]" in found
+    assert "<figcaption>" in found
     x, y = float(chart.across(1.0)), float(chart.up(0.5))
     assert f"translate({x:.1f} {y:.1f})" in found
     assert chart.up(1.0) < chart.up(0.0)

@@ -212,4 +212,5 @@ def test_the_policy_refuses_a_script_that_gets_into_the_page(browser: Any, tmp_p
     path = write_page(context, tmp_path / "report.html", [Careless()])
     opened = Opened(browser, path)
     assert_names(opened.page.title(), "guarded")
+    assert any("Content Security Policy" in message for message in opened.said)
     opened.context.close()

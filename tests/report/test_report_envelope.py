@@ -32,7 +32,6 @@ def test_each_row_of_a_map_is_shaded_where_tasks_are_trusted(dimension: int, ban
     for label in context.space.labels[:2]:
         assert label in html
     assert ("at " in html.split("<figcaption>")[1]) == (dimension > 2)
-    assert ("executed below the threshold" in html) == (dimension == 2)
 
 
 def test_one_that_is_withdrawn_has_its_reason_and_no_picture() -> None:

@@ -231,7 +231,9 @@ def test_a_diverged_execution_is_a_failed_trial(tmp_path: Path, monkeypatch: pyt
     )
     assert np.isnan(broken.distances([[0.0], [0.1]])).tolist() == [False, True]
     campaign = Campaign(broken, search=searches.Random()).run(3)
-    assert [trial.failure for trial in campaign.failed] == ["terminated: MuJoCo warned of BADQACC at step 2"] * 3
+    assert len(campaign.failed) == 3
+    for trial in campaign.failed:
+        assert_names(str(trial.failure), "BADQACC", 2)
 
 
 # What the user may get wrong

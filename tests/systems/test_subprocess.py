@@ -505,9 +505,7 @@ def test_timeouts_must_be_positive(timeout: Any) -> None:
 
 
 def test_a_campaign_on_a_command_records_its_failures(tmp_path: Path) -> None:
-    code = RIG.replace(
-        "x, rows = task", "sys.exit('over the edge') if task['reference'][-1][0] > 1 else 0; x, rows = task"
-    )
+    code = RIG.replace("x, rows = task", "sys.exit('over edge') if task['reference'][-1][0] > 1 else 0; x, rows = task")
     validation = Validation(
         space=TaskSpace(goal=(0.5, 1.5, "m")),
         task=lambda p: Task([0.0, 0.0], goal=[p.goal, 0.0], horizon=20, dt=0.1),
@@ -518,7 +516,7 @@ def test_a_campaign_on_a_command_records_its_failures(tmp_path: Path) -> None:
     )
     campaign = Campaign(validation, search=searches.Random()).run(6)
     assert 0 < len(campaign.failed) < 6
-    assert all(str(trial.failure).endswith("over the edge") for trial in campaign.failed)
+    assert all(str(trial.failure).endswith("over edge") for trial in campaign.failed)
 
 
 @pytest.mark.slow

@@ -339,7 +339,7 @@ def test_a_campaign_by_hand_by_forms_alone(tmp_path: Path) -> None:
             server, "/choose", page, {"how": "again", "trial": "1", "because": "motor <replaced>", "seen": "2"}
         )
         assert asked.status == 303
-        wait_for(server, 'id="trial-2"', page)
+        assert "motor &lt;replaced&gt;" in wait_for(server, 'id="trial-2"', page)
         assert post(server, "/trials/2/distance", page, {"distance": "0.04"}).status == 303
         assert post(server, "/choose", page, {"how": "own", "parameter-0": "1.5", "seen": "3"}).status == 303
         wait_for(server, 'id="trial-3"', page)
@@ -399,6 +399,7 @@ def test_a_wrong_result_is_replaced_with_a_reason(tmp_path: Path) -> None:
         wrong = upload(server, 0, page, SHORT, replace="the <first> run")
         assert wrong.status == 422
         assert_names(problem(wrong), 21)
+        assert "the &lt;first&gt; run" in wrong.text
         for _ in range(2):  # the same form, sent twice
             told = upload(server, 0, page, recording, replace="the <first> run", submission="one")
             assert (told.status, told.headers["location"]) == (303, "/?told=0#message")

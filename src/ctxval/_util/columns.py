@@ -35,10 +35,10 @@ _OTHER_NAMES = {
 }
 _FACTOR = re.compile(r"([A-Za-z°µμ]+|1)(?:\^?(-?[1-4]))?")
 
-# The forms ``angle [deg]``, ``angle (deg)``, ``angle_deg`` and ``rate_deg_s``.
+# The forms ``angle [deg]``, ``angle (deg)``, ``angle_deg`` and ``rate_deg_s``; MATLAB makes ``t__ms_`` of ``t [ms]``.
 _BRACKETS = re.compile(r"(.*?)\s*(?:\[\s*(?!\d+\s*\])([^\[\]]*?)\s*\]|\(([^()]*)\))\s*")
 _SUFFIX = re.compile(
-    r"(.+?)_(deg|rad|mrad|rpm|dps|mps|kmh|(?:[kcmun]?(?:m|s|N|Nm|V|A))|sec|msec|usec|nsec)(?:_(?:per_)?(s2?))?"
+    r"(.+?)_+(deg|rad|mrad|rpm|dps|mps|kmh|(?:[kcmun]?(?:m|s|N|Nm|V|A))|sec|msec|usec|nsec)(?:_(?:per_)?(s2?))?_?"
 )
 
 

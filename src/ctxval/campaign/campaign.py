@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.checked import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Seconds, checked
+from ctxval._util.checked import (
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Seconds,
+    TimeLimit,
+    checked,
+)
 from ctxval._util.describe import describe
 from ctxval._util.progress import progress_shown, stage
 from ctxval._util.representation import call
@@ -195,6 +203,7 @@ class Campaign:
         timeout: Seconds | None = None,
         retries: NonNegativeInt = 2,
         retry_failures: NonNegativeInt = 0,
+        thinking: TimeLimit | None = None,
         progress: bool | None = None,
     ) -> Campaign:
         """Execute the tasks that narrow the interval of d*, until it decides or the budget is spent.
@@ -234,6 +243,9 @@ class Campaign:
                 system is executed in a separate process.
             retries: largest number of repetitions of an execution if its worker is lost.
             retry_failures: largest number of repetitions of an execution if the system fails.
+            thinking: seconds of CPU that the choice of a task may take, verdict included. Stages that do not fit are
+                replaced by cheaper ones. By default, it is the time of one execution or 5 s, whichever is longer, and
+                12 times that for the evidence of a verdict; infinity for no limit.
             progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
 
         Raises:
@@ -276,7 +288,8 @@ class Campaign:
             raise InputError("retry_failures needs workers, an executor or a timeout.")
         if threshold is not None:
             self.state_threshold(threshold)
-        with self.recorder.predicting(decides is not None and decides.predicts), progress_shown(progress):
+        predicts = decides is not None and decides.predicts
+        with self.recorder.predicting(predicts, thinking), progress_shown(progress):
             ExecutionLoop(
                 self.recorder,
                 rule,
@@ -374,6 +387,7 @@ class Campaign:
         confidence: float = CONFIDENCE,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
+        thinking: TimeLimit | None = None,
         wait: NonNegativeFloat = 0.0,
         progress: bool | None = None,
     ) -> OpenTrial | None:
@@ -387,7 +401,7 @@ class Campaign:
             self.refresh()
             search = IntervalSearch(self.recorder, options, budget, threshold)
             self.state_threshold(threshold)
-            with self.recorder.predicting(search.predicts):
+            with self.recorder.predicting(search.predicts, thinking):
                 choice = search.choose() if self.executions + len(self.trials.open) < budget else None
                 return None if choice is None else self.recorder.open(choice)
 
@@ -537,6 +551,7 @@ class Campaign:
         *,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
+        thinking: TimeLimit | None = None,
         progress: bool | None = None,
     ) -> Verdict:
         """Return whether the model can be trusted up to a threshold tau.
@@ -551,6 +566,7 @@ class Campaign:
             resolution: the largest distance between a task and its nearest trial that a validation permits, in
                 diagonals of the task space.
             certificate: the kind and the options of the certificate, in place of ``auto`` with the two options above.
+            thinking: as in :meth:`run`. If its evidence needs more, the verdict is undecided with the code ``no_time``.
             progress: as in :meth:`run`.
 
         Raises:
@@ -558,9 +574,14 @@ class Campaign:
         """
         options, recorder = CertificateOptions.or_automatic(certificate, confidence, resolution), self.recorder
         self.state_threshold(threshold)
-        with progress_shown(progress), stage("certifying"):
-            known = self.provenance_for(options, threshold)
-            return with_next_task(judge(recorder.trials, threshold, options, known), recorder, options)
+        recorder.dynamics.shortage = None
+        with progress_shown(progress), stage("certifying"), recorder.dynamics.thinking.limited(thinking):
+            known, shortage = self.provenance_for(options, threshold), recorder.dynamics.shortage
+            if shortage is None:
+                verdict = judge(recorder.trials, threshold, options, known)
+            else:  # another bound has not seen what this evidence might show, such as noise
+                verdict = Verdict("undecided", threshold, f"{shortage}.", shortage=shortage.to_json())
+            return with_next_task(verdict, recorder, options)
 
     @checked
     def certify(

@@ -17,6 +17,7 @@ from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.history import at_points, executed_trials
 from ctxval.campaign.storage.store import Store
+from ctxval.campaign.thinking import THINKING, CampaignThinking, TimeShortage
 from ctxval.certificates.checks import is_open
 from ctxval.certificates.dynamics import draws_for
 from ctxval.certificates.evidence import Evidence, Learned, Predicted
@@ -33,6 +34,7 @@ from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.coverage import unsampled_corner
 from ctxval.learning.prediction import Executed
+from ctxval.learning.stage_costs import Ledger
 from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
@@ -40,7 +42,7 @@ from ctxval.searches.base import Pending
 PREDICTION = "prediction"  #: key of the prediction of an execution in the note of its trial
 NEAR = 0.02  #: a task that differs from an executed one by less than this in every coordinate is no new one
 
-_Known = Latest[tuple[object, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None]]
+_Known = Latest[tuple[object, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None, Ledger]]
 
 
 def prediction_in(note: Mapping[str, Any] | None) -> ExecutionPrediction | None:
@@ -68,7 +70,10 @@ class CampaignDynamics:
         self._store = store
         self.extra_recordings: Callable[[], Sequence[Trajectory]] = tuple
         self.failure: str | None = None
+        self.shortage: TimeShortage | None = None  #: why the last verdict has no evidence; None if it has some
         self._use(DynamicsStudy(validation, seed))
+        manual = bool(getattr(validation.system, "manual", False))
+        self.thinking = CampaignThinking(self.study.validation, manual, self.study.settings.thinking)
 
     def _use(self, study: DynamicsStudy) -> None:
         self.study, self._learned = study, _Known(LIMITS.predictions + 3)
@@ -89,17 +94,35 @@ class CampaignDynamics:
         # The other recordings are kept with what they taught, so that their identities stay theirs. A result may be
         # replaced, and then has another distance.
         allowed = self._allowed(trials)
-        key = (allowed, *((trial.number, trial.distance) for trial, _ in executed), *map(id, others))
+        results = tuple((trial.number, trial.distance) for trial, _ in executed)
+        key = (self.thinking.after(trials), allowed, *results, *map(id, others))
         if key not in self._learned:
             learned, failure = None, None
+            ledger = self.thinking.ledger(trials, len(executed))
             try:
-                self._parts = self._parts or self.study.state_of_parts()
-                learned = self.study.learn(at_points(executed), others, allowed)
+                with ledger.spending("learning"):
+                    if not ledger.spent_up:
+                        self._parts = self._parts or self.study.state_of_parts()
+                        learned = self.study.learn(at_points(executed), others, allowed, ledger)
             except Exception as error:  # users' parts
                 failure = reason_of(error)
-            self._learned[key] = others, learned, failure
-        _, learned, self.failure = self._learned[key]
+            self._learned[key] = others, learned, failure, ledger
+        _, learned, self.failure, self._ledger = self._learned[key]
         return learned
+
+    def ledger(self, trials: Sequence[Trial]) -> Ledger:
+        """Return the budget of the choice after trials, and what its stages took."""
+        self.learned(trials)
+        return self._ledger
+
+    def has_no_time(self, trials: Sequence[Trial]) -> bool:
+        """Return whether the budget of the choice after trials allows no closed loops; nothing is learned."""
+        return self.thinking.ledger(trials, len(executed_trials(self._store, trials))).spent_up
+
+    def note(self, trials: Sequence[Trial]) -> dict[str, Any]:
+        """Return what the next trial stores of the thinking on its task; empty without a budget."""
+        note = self.thinking.note(trials, self.ledger(trials) if trials else Ledger())
+        return {} if note is None else {THINKING: note}
 
     def _allowed(self, trials: Sequence[Trial]) -> float:
         """Return the distance that is negligible beside all stated thresholds; 0 if executed ones are larger."""
@@ -146,7 +169,7 @@ class CampaignDynamics:
     def predict(self, trials: Sequence[Trial], point: Array, *, alone: bool = False) -> ExecutionPrediction | None:
         """Return the prediction at a point ``(d,)``, with ``alone`` from trials alone; None if there is none."""
         try:
-            with stage("predicting the execution", unit="closed loops"):
+            with stage("predicting the execution", unit="closed loops"), self.ledger(trials).spending("loops"):
                 learned = self.learned(trials, alone=alone)
                 return None if learned is None else learned.predict(point)
         except Exception:  # users' parts
@@ -158,7 +181,10 @@ class CampaignDynamics:
         It has a few draws, and none but the posterior mean after fewer executions than a bound needs. With ``pending``
         as in :meth:`prediction`, it helps to choose a task and decides nothing.
         """
-        with stage("searching the learned dynamics", self.study.search.screening_loops, "closed loops"):
+        if self.has_no_time(trials):
+            return None
+        ledger, loops = self.ledger(trials), self.study.search.screening_loops
+        with stage("searching the learned dynamics", loops, "closed loops"), ledger.spending("loops"):
             learned = self.learned(trials)
             few = learned is not None and len(learned.executed) < LIMITS.fewest
             if learned is not None and pending:
@@ -175,16 +201,47 @@ class CampaignDynamics:
         kept = self.kept_evidence(trials, confidence)
         if kept is not None:
             return kept
-        digest, draws = self._store.digest(), draws_for(confidence)
-        with stage("searching the learned dynamics", self.study.search.expected_loops(draws), "closed loops"):
-            learned = self.learned(trials)
+        digest, draws, self.shortage = self._store.digest(), draws_for(confidence), None
+        loops = None if self.has_no_time(trials) else self.study.search.expected_loops(draws)
+        with stage("searching the learned dynamics", loops, "closed loops"):
             try:
-                evidence = None if learned is None else self._whole(learned, trials, confidence)
+                evidence = self._within_budget(trials, confidence)
             except Exception as error:  # users' parts
                 self.failure, evidence = reason_of(error), None
         if keep and evidence is not None and not self.extra_recordings():
             self._store.keep_computed(self._key(trials, confidence), evidence.to_json(), digest)
         return evidence
+
+    def _within_budget(self, trials: Sequence[Trial], confidence: float) -> Evidence | None:
+        """Return the whole evidence; None if nothing can be learned, or if the budget of a verdict does not suffice."""
+        learned, ledger = self.learned(trials), self.ledger(trials)
+        with self.thinking.deciding():
+            budget = self.thinking.after(trials)
+            if budget is None or ledger.costs is None:
+                return None if learned is None else self._whole(learned, trials, confidence, ledger)
+            # The choice of a task may have left out what the longer time of a verdict allows.
+            incomplete = ledger.spent_up or (learned is not None and not learned.is_complete)
+            if incomplete and budget.seconds > ledger.costs.thinking.seconds:
+                learned, ledger = self.learned(trials), self.ledger(trials)
+        if learned is None and not ledger.spent_up:
+            return None
+        by, draws, replicates = self.thinking.search_settings, draws_for(confidence), 1
+        if learned is not None and learned.is_complete:
+            replicates = 1 if learned.noisy is None else learned.noisy.replicates
+            learned = learned.with_whole_search()
+        with ledger.within(budget), ledger.spending("loops"):
+            # Errors of M that are negligible are no function to search.
+            is_cheap = learned is not None and not learned.posterior.data.learned.any()
+            needed = 0.0 if is_cheap else ledger.seconds("loops", lambda costs: costs.whole(by, draws, replicates))
+            if learned is not None and not ledger.incomplete and needed <= ledger.left:
+                ledger.add("loops", needed)
+                evidence = self._whole(learned, trials, confidence, ledger)
+                if not ledger.missing:
+                    return replace(evidence, replaced=tuple(dict.fromkeys(ledger.replaced)))
+                needed = ledger.missing
+            needed += sum(ledger.expected.values()) + ledger.incomplete
+            self.shortage = TimeShortage(needed, budget.seconds, tuple(dict.fromkeys(ledger.replaced)))
+            return None
 
     def kept_evidence(self, trials: Sequence[Trial], confidence: float) -> Evidence | None:
         """Return :meth:`evidence` that the store keeps for these trials; None if there is none."""
@@ -199,11 +256,14 @@ class CampaignDynamics:
         physical = "".join(f"{name} " for name in self.study.given.physical)
         return f"evidence {confidence} {self.study.quantile} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
-    def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float) -> Evidence:
+    def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float, ledger: Ledger) -> Evidence:
         draws, drawn_from = draws_for(confidence), learned.drawn_from
         without_model = learned.posterior.covariances.without_model
         known = {"noise": drawn_from.noise, "groups": drawn_from.functions_for(draws), "without_model": without_model}
         evidence = self._evidence(learned, trials, learned.worst_case_of(draws), confidence=confidence, **known)
+        names, part = len(self.study.given.space.units) + 1, "the parameter that the dynamics seem to depend on"
+        asks = evidence.failed is not None
+        asks = asks and ledger.optional("learning", part, lambda costs: names * costs.learning())
         influential = learned.influential
         evidence = replace(
             evidence,
@@ -211,7 +271,7 @@ class CampaignDynamics:
             influential=None if influential is None else tuple(influential.tolist()),
             drift=learned.drift,
             uneven=learned.uneven_friction,
-            suspect=None if evidence.failed is None else learned.study.suspected_parameter(learned),
+            suspect=learned.study.suspected_parameter(learned) if asks else None,
         )
         # How many tests a verdict needs is not known here. Negligible errors are no function to search, nor to push.
         if evidence.negligible or is_open(evidence, "learning", "coverage", "tested", "explained", "search"):
@@ -221,6 +281,9 @@ class CampaignDynamics:
         further |= {"jump": jump, "unvisited_region": learned.unvisited_region}
         # The maxima of a distance with kinks lie on ridges, which deeper searches climb higher.
         if is_kinked(learned.study.given.distance) or (evidence.low_dimensional and replace(evidence, jump=jump).jumps):
+            if not ledger.fits("loops", lambda costs: costs.intensified(learned.search.settings)):
+                ledger.missing = ledger.seconds("loops", lambda costs: costs.intensified(learned.search.settings))
+                return replace(evidence, **further)
             values, points = learned.intensified_search
             low, high = values.min(), values.max()
             further["disagreement"] = float(1 - low / high) if high > 0 else 0.0
@@ -231,7 +294,10 @@ class CampaignDynamics:
                     "highest": float(high),
                     "local_maxima": local_maxima,
                 }
-        if learned.noisy is None:  # a push is compared with residuals of state and input, which do not hold with noise
+        # A push is compared with residuals of state and input, which do not hold with noise.
+        if learned.noisy is None and ledger.optional(
+            "loops", "pushes that the bound survives", lambda costs: costs.pushes(learned.search.settings)
+        ):
             further["pushed"] = learned.push_response
         return replace(evidence, **further)
 
@@ -277,13 +343,14 @@ class CampaignDynamics:
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
             actuator=None if actuator is None else (actuator.delay, actuator.lag),
             friction=learned.friction,
+            untested_rest=learned.untested_rest,
             physical=learned.study.given.physical,
             without_data=not learned.with_data,
             estimated=learned.study.given.outputs is not None,
             negligible=learned.negligible,
             best=Trials(trials).largest,
             worst=() if (largest := Trials(trials).worst) is None else tuple(largest.unit_point.tolist()),
-            idle=tuple(learned.study.unseen_parameters),
+            idle=tuple(learned.unseen_parameters),
             **known,
         )
 
@@ -295,8 +362,14 @@ class CampaignDynamics:
             before = completed[:place]
             prediction = stored = self.stored_prediction(trial)
             if stored is None:
-                recent = place >= len(completed) - LIMITS.predictions - 1
-                if not recent or self.learned(before, alone=True) is None:
+                if place < len(completed) - LIMITS.predictions - 1:
+                    continue
+                part = "predictions of executions afterwards"
+                if not self.ledger(trials).optional(
+                    "learning", part, lambda costs: costs.learning() + costs.prediction(40)
+                ):
+                    continue
+                if self.learned(before, alone=True) is None:
                     continue
                 key = tuple((each.number, each.distance) for each in completed[: place + 1])
                 if key not in self._afterwards:

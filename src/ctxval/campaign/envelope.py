@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -39,8 +39,19 @@ from ctxval.core.trial import Trial, Trials
 from ctxval.errors import InputError
 from ctxval.learning import LearnedDynamics
 
-_CANDIDATES = 8192  # tasks among which these are chosen
-_SCREENED = 256  # tasks of the pool among which the next one is chosen
+
+@dataclass(frozen=True)
+class CandidateSettings:
+    """How many tasks the next one is chosen from."""
+
+    candidates: int = 8192  #: tasks among which these are chosen
+    screened: int = 256  #: tasks of the pool among which the next one is chosen
+
+
+CANDIDATES = CandidateSettings()
+"""The settings in use."""
+
+
 _SAME_TASK = 1e-6
 
 
@@ -183,7 +194,7 @@ class EnvelopeSearch:
         if parameter is not None and parameter.gap > evidence.limits.gap:
             return Choice.tested(parameter.task)
         pool, is_suite = learned.study.search.pool, recorder.validation.space.members is not None
-        drawn = self._at(learned, pool if is_suite else pool[:_SCREENED], settled=False)
+        drawn = self._at(learned, pool if is_suite else pool[: CANDIDATES.screened], settled=False)
         below, leaving = drawn.mean <= self._threshold, drawn.uncovered(evidence.most_beyond)
         # Within three spreads above the mean, a task is uncertain.
         straddle = 3.0 * drawn.spread(self._threshold) - np.abs(drawn.mean - self._threshold)  # Bryan et al. 2006
@@ -229,7 +240,7 @@ class EnvelopeSearch:
         drawn = self._at(learned, np.concatenate([pool[:192] if noisy else pool, learned.executed]))
         if not learned.study.planner.batched:
             return drawn  # each further task costs a design of its own
-        candidates = np.random.default_rng(1).random((_CANDIDATES, space.dimension))
+        candidates = np.random.default_rng(1).random((CANDIDATES.candidates, space.dimension))
         # Tasks next to the boundary at which closed loops are run, beside those of the pool.
         for count in (64,) if noisy else (512,) * max(space.dimension // 2, 1):
             nearest = boundary_tasks(drawn, evidence, self._threshold, self._confidence, candidates, count)

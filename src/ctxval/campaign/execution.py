@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from ctxval._util.cores import Interrupts, exits_as_exceptions
 from ctxval._util.progress import advance, is_heard, stage
@@ -20,8 +20,17 @@ from ctxval.core.trajectory import DIVERGED, TERMINATED, Trajectory
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import CampaignError, CtxvalError, ExecutionError, InputError, StoreError
 
-_ALIKE = 3  # executions that fail alike, after which a campaign stops if there are no others
-_IN_A_ROW = 6  # the same, if earlier ones did not fail
+
+@dataclass(frozen=True)
+class StopSettings:
+    """When failures end a campaign."""
+
+    alike: int = 3  #: executions that fail alike, after which a campaign stops if there are no others
+    in_a_row: int = 6  #: the same, if earlier ones did not fail
+
+
+STOP = StopSettings()
+"""The settings in use."""
 
 
 class ExecutionLoop:
@@ -169,11 +178,11 @@ class ExecutionLoop:
         They are all executions if none moved, or the last ones in a row of this call: who runs again goes on.
         """
         failed = ended = [trial for trial in self.recorder.trials if trial.executed]
-        if len(ended) < _ALIKE or not self.in_a_row or (self.budget is not None and len(ended) >= self.budget):
+        if len(ended) < STOP.alike or not self.in_a_row or (self.budget is not None and len(ended) >= self.budget):
             return None
-        which, fewest, numbers = "all", _ALIKE, [trial.number for trial in ended]
+        which, fewest, numbers = "all", STOP.alike, [trial.number for trial in ended]
         if any(trial.state != "failed" for trial in ended) or self.recorder.store.trajectories(numbers, "system"):
-            failed, which, fewest = self.in_a_row, "the last", _IN_A_ROW
+            failed, which, fewest = self.in_a_row, "the last", STOP.in_a_row
         if len(failed) < fewest:
             return None
         reasons = {re.sub(r"[-+.\d]+", "", trial.failure or "") for trial in failed}

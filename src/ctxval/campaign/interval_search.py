@@ -28,7 +28,7 @@ from ctxval.certificates.bounds import Quantities, with_units
 from ctxval.certificates.checks import Remedy, open_checks
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
-from ctxval.certificates.explained import LEVERAGE
+from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import DistanceBound
 from ctxval.certificates.prediction_tests import DRAWN, HYPERCUBE, MANY, TESTS, hypercube_in
@@ -39,8 +39,17 @@ from ctxval.core.trial import Trial, Trials
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.worst_case import is_kinked
 
-_HYPERCUBES = 128  # from which the one that is executed is chosen
-_FAR = 10.0  # multiple of what is known or allowed from which a predicted distance is said to be dangerous
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How tests are chosen, and of what a choice warns."""
+
+    hypercubes: int = 128  #: from which the one that is executed is chosen
+    far: float = 10.0  #: multiple of what is known or allowed from which a predicted distance is said to be dangerous
+
+
+SEARCH = SearchSettings()
+"""The settings in use."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +118,8 @@ class IntervalSearch:
         trials = self.recorder.trials
         if not self.recorder.has_tasks:
             return None
+        if self.recorder.predicts:  # what only reads a store chooses as the stored speed allows
+            self.recorder.dynamics.thinking.measure(trials)
         if self.threshold is not None and any(trial.least > self.threshold for trial in trials):
             repeated = self._against_noise()
             if repeated is not None or self.is_falsified:
@@ -149,8 +160,10 @@ class IntervalSearch:
         learned, needed = self.recorder.dynamics.learned(self.recorder.trials), min(self.tests, TESTS)
         if learned is None:
             return 0, 1.0
-        tasks = np.stack([self.recorder.draws.hypercube(number, k)[:needed] for k in range(_HYPERCUBES)])
-        is_large = learned.near_pool(tasks.reshape(-1, tasks.shape[2])) >= LEVERAGE * learned.worst_of_mean.highest
+        tasks = np.stack([self.recorder.draws.hypercube(number, k)[:needed] for k in range(SEARCH.hypercubes)])
+        is_large = (
+            learned.near_pool(tasks.reshape(-1, tasks.shape[2])) >= LIMITS.leverage * learned.worst_of_mean.highest
+        )
         large = is_large.reshape(tasks.shape[:2]).sum(axis=1)
         alike = large >= min((needed + 1) // 2, large.max())
         return int(alike.argmax()), float(alike.mean())
@@ -198,7 +211,9 @@ class IntervalSearch:
         rule = StoppingRule(self.limit, self.options.confidence, kind.resolution)
         now = rule.decide(self.recorder.trials, self.budget - self.recorder.trials.executions)
         if not now.decided:
-            return Choice(now.next_point, "covering", planned_draws=0)
+            # Whether the task is steady is not tested if there is no time for closed loops.
+            rejected = 0 if self.recorder.dynamics.has_no_time(self.recorder.trials) else None
+            return Choice(now.next_point, "covering", planned_draws=0, rejected=rejected)
         missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self.recorder.trials.ended))
         return self.test() if missing else None
 
@@ -214,8 +229,8 @@ class IntervalSearch:
             decides = not open_checks(evidence)
         if decides:
             whole = dynamics.evidence(trials, confidence, keep=self.keeps)
-            if whole is None:
-                return self._by_distance()
+            if whole is None:  # more executions do not help if time is short
+                return None if dynamics.shortage is not None else self._by_distance()
             evidence = self._asked(whole)
             with suppress(CertificateError):
                 sample = replace(Sample.of(trials.ended), threshold=self.limit)
@@ -229,13 +244,16 @@ class IntervalSearch:
         lacks_tests = remedy.kind == "drawn"
         if isinstance(kind, Automatic) and evidence.quantile is None and self._suite is None:
             chosen = sum(trial.origin not in DRAWN for trial in trials)
-            in_a_region = any(opened.code == "unvisited_region" for opened in open_checks(evidence))
-            if chosen >= 16 and not lacks_tests and not in_a_region:
+            in_places = any(opened.code in ("unvisited_region", "untested_rest") for opened in open_checks(evidence))
+            if chosen >= 16 and not lacks_tests and not in_places:
                 return self._by_distance()
             covers = not evidence.negligible and covering(self._points(trials), kind.resolution, 0) is not None
             if covers and self._by_distance() is None:
                 return None
-        return self.test() if lacks_tests else self._by_evidence(evidence)
+        ledger = dynamics.ledger(trials)
+        ledger.charge("loops", lambda costs: costs.next_task())
+        with ledger.spending("loops"):
+            return self.test() if lacks_tests else self._by_evidence(evidence)
 
     def _first_remedy(self, evidence: Evidence) -> Remedy:
         """Return what the first open check needs that an execution can close; tasks of a suite are executed once."""
@@ -252,7 +270,8 @@ class IntervalSearch:
         new = CandidateFilter(self._near, steady)
         # Tasks that differ in parameters that change no prediction are one task, with values that are spread.
         if learned is not None and self._suite is None:
-            new = CandidateFilter(self._near, steady, learned.spread_unseen, learned.study.seen_parameters)
+            moved = learned.spread_unseen, learned.seen_parameters, learned.at_untested_rest
+            new = CandidateFilter(self._near, steady, *moved)
         point = next_task(evidence, known, new)
         if len(waiting) and (point is None or np.abs(waiting - point)[:, new.seen].max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.
@@ -346,7 +365,7 @@ def with_next_task(verdict: Verdict, recorder: TrialRecorder, options: Certifica
     space = recorder.validation.space
     point = space.from_unit(space.rounded(choice.unit_point))
     task, learned = with_units(space.labelled(point)), recorder.dynamics.learned(recorder.trials)
-    far = _FAR * max(search.best, search.limit)
+    far = SEARCH.far * max(search.best, search.limit)
     if learned is not None and not learned.expected(choice.unit_point[None])[0] <= far:
         task = f"(caution: its predicted run goes far beyond all others; be ready to stop it) {task}"
     reason = f"{verdict.reason.removesuffix('.')}; next task: {task}."

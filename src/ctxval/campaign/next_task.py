@@ -22,6 +22,8 @@ class CandidateFilter:
     #: moves a new task ``(d,)``, given the known ones ``(n, d)``; None if tasks are not moved
     spread: Callable[[Array, Array], Array] | None = None
     seen: Rows | slice = field(default_factory=lambda: slice(None))  #: coordinates in which a moved task must be new
+    #: a task like this one ``(d,)`` that also tests friction at rest where it is needed; None if there is none
+    at_untested_rest: Callable[[Array], Array | None] = lambda task: None
 
     def first(self, tasks: Array, known: Array, farthest: Array) -> Array | None:
         """Return the first of tasks ``(m, d)`` that may be executed, as it is moved; None if there is none."""
@@ -52,4 +54,9 @@ def next_task(evidence: Evidence, known: Array, new: CandidateFilter) -> Array |
     others = np.random.default_rng(len(known)).random((256, known.shape[1]))
     away = np.abs(others[:, None] - known).max(axis=2).min(axis=1, initial=1.0)
     tasks += [*in_turn(evidence, len(known)).tasks, others[np.argsort(-away, kind="stable")]]
-    return new.first(np.concatenate(tasks), known, evidence.coverage.task)
+    farthest, chosen = evidence.coverage.task, new.first(np.concatenate(tasks), known, evidence.coverage.task)
+    # A draw with more friction at rest is ruled out at any place, so the place is one where it is untested.
+    of_a_draw = evidence.friction and chosen is not None and (evidence.points == chosen).all(axis=1).any()
+    elsewhere = new.at_untested_rest(chosen) if of_a_draw and chosen is not None else None
+    moved = None if elsewhere is None else new.first(elsewhere[None], known, farthest)
+    return chosen if moved is None else moved

@@ -25,6 +25,7 @@ from ctxval.campaign.choices import Choice
 from ctxval.campaign.costs import costs_of
 from ctxval.campaign.dynamics import PREDICTION, CampaignDynamics
 from ctxval.campaign.storage.store import Store
+from ctxval.campaign.thinking import THINKING
 from ctxval.certificates.prediction_tests import TESTS
 from ctxval.core.model import Step, run_of
 from ctxval.core.rollout import rollout
@@ -115,6 +116,7 @@ class Proposals:
 
     def __init__(self, validation: Validation, search: BaseSearch, dynamics: CampaignDynamics) -> None:
         self._validation, self._search, self._dynamics = validation, search, dynamics
+        self.thinking: float | None = None  # seconds that a choice may take, if they are stated
 
     def next(self, trials: Sequence[Trial], rejected: int = 0) -> tuple[Array, Note]:
         """Return the search's next point ``(d,)``, tested and rounded unless an earlier trial has it, and its note."""
@@ -128,12 +130,14 @@ class Proposals:
                     costs = partial(costs_of, prediction, self._validation, trials)
                     left = remaining_tasks(self._validation, trials)
                     prediction = replace(prediction, costs=costs, steady=steady, candidates=left)
+                    prediction = replace(prediction, thinking=self.thinking)
                 search.use_prediction(prediction)
             point, note = self._asked()
             repeats = self._validation.space.members is None
             if repeats and any(point.tobytes() == trial.unit_point.tobytes() for trial in trials):
                 return point, note
-            point, note = self._final(point, trials, None if search.iid else steady, note, rejected)
+            untested = search.iid or self._dynamics.has_no_time(trials)
+            point, note = self._final(point, trials, None if untested else steady, note, rejected)
             if isinstance(search, SequentialSearch):
                 search.amend(point)
             return point, note
@@ -176,7 +180,7 @@ class Proposals:
         if point.shape != (1, dimension) or not ((point >= 0) & (point <= 1)).all():
             got = shortened(repr(asked), 200)
             raise InputError(f"a search must return points of the unit cube, shape (1, {dimension}), got {got}.")
-        note, reserved = self._search.note(), (PREDICTION, CONVERGED, UNSTEADY)
+        note, reserved = self._search.note(), (PREDICTION, CONVERGED, UNSTEADY, THINKING)
         if isinstance(note, dict) and set(reserved) & set(note):
             raise InputError(f"the note of a search must not have the keys {enumerated(reserved, 10)}.")
         with suppress(TypeError, ValueError):

@@ -239,8 +239,12 @@ class TrialRecorder:
             self.search.tell(unit_point[None], [np.nan])
         if origin == "iid" and choice.planned_draws is not None:
             note = {**(note or {}), PLANNED: choice.planned_draws}
+        if self.predicts:
+            self.dynamics.thinking.measure(trials)
         if self.predicts and (predicted := self.dynamics.predict(trials, unit_point)) is not None:
             note = {**(note or {}), PREDICTION: {**predicted.to_json(), "experiment": self.dynamics.experiment}}
+        if self.predicts and (thought := self.dynamics.note(trials)):
+            note = {**(note or {}), **thought}
         key = unit_point.tobytes()
         same = (trial.parameters for trial in trials if trial.unit_point.tobytes() == key)
         parameters = choice.parameters or next(same, None) or space.describe_point(space.from_unit(unit_point))
@@ -316,13 +320,18 @@ class TrialRecorder:
         return trials
 
     @contextmanager
-    def predicting(self, predicts: bool) -> Iterator[None]:
-        """Predict the executions of the trials that are opened within this context, and store the predictions."""
+    def predicting(self, predicts: bool, thinking: float | None = np.inf) -> Iterator[None]:
+        """Predict the executions of the trials that are opened within this context, and store the predictions.
+
+        A choice takes at most so many seconds of ``thinking``; None for the default.
+        """
         before, self.predicts = self.predicts, predicts
+        self._proposals.thinking = thinking if thinking is not None and np.isfinite(thinking) else None
         try:
-            yield
+            with self.dynamics.thinking.limited(thinking if predicts else np.inf):
+                yield
         finally:
-            self.predicts = before
+            self.predicts, self._proposals.thinking = before, None
 
     @contextmanager
     def not_executing(self, trial: Trial) -> Iterator[None]:

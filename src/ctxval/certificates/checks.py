@@ -32,8 +32,6 @@ from ctxval.core.coverage import StateInputGap
 
 Stage = Literal["learning", "coverage", "tested", "tests", "explained", "search", "support", "bound"]
 
-_NEARS = 0.7  # share of the way from the largest executed distance to the limit from which a draw is near it
-_TIMES = 4  # executions of a task that are chosen because one execution does not explain it
 _SAME = 1e-9  # largest difference of the coordinates of two executions of one task
 
 
@@ -230,6 +228,14 @@ def _unsupported(evidence: Evidence) -> Gap | None:
     return Gap(-ratio, values, -evidence.limits.supported)
 
 
+def _untested_rest(evidence: Evidence) -> Gap | None:
+    rest = evidence.untested_rest
+    if rest is None or rest.highest <= (evidence.raised if evidence.threshold is None else evidence.threshold):
+        return None
+    values = {"place": with_units(rest.place), "length": radius_of(dict.fromkeys(rest.place, rest.length))}
+    return Gap(rest.size, {**values, "times": rest.times, "highest": rest.highest})
+
+
 # Measures: the search
 
 
@@ -283,7 +289,7 @@ def _draws(evidence: Evidence) -> Array:
     """
     order, rank = np.argsort(evidence.maxima, kind="stable"), evidence.rank
     if evidence.friction and evidence.threshold is not None:
-        near = evidence.best + _NEARS * (evidence.threshold - evidence.best)
+        near = evidence.best + evidence.limits.near * (evidence.threshold - evidence.best)
         first = int(np.searchsorted(evidence.maxima[order], near, side="right"))
         return evidence.points[[*order[first:], *order[:first][::-1]]]
     return evidence.points[[*order[rank::-1], *order[:rank:-1]]]
@@ -325,6 +331,12 @@ def _at_the_corner(evidence: Evidence, known: int) -> Remedy:
 def _in_the_region(evidence: Evidence, known: int) -> Remedy:
     region = evidence.unvisited_region
     return _beyond_the_records(evidence, known, *([] if region is None else [np.array(region.tasks)]))
+
+
+def _in_the_stretch(evidence: Evidence, known: int) -> Remedy:
+    rest = evidence.untested_rest
+    tasks = [] if rest is None or not rest.tasks else [np.array(rest.tasks)]
+    return Remedy((*tasks, *in_turn(evidence, known).tasks))
 
 
 def in_turn(evidence: Evidence, known: int) -> Remedy:
@@ -372,7 +384,7 @@ def _least_explained(evidence: Evidence, known: int) -> Remedy:
     assert least is not None
     task = np.array(least.point)
     times = sum(np.abs(np.array(each.point) - task).max() <= _SAME for each in evidence.executed)
-    return Remedy((task[None],), "again") if times < _TIMES else Remedy()
+    return Remedy((task[None],), "again") if times < evidence.limits.repetitions else Remedy()
 
 
 CHECKS = (
@@ -569,6 +581,15 @@ CHECKS = (
         "",
         "A prediction that failed leaves only thresholds credible that are far above the bound.",
         _past_a_failed_prediction,
+    ),
+    Check(
+        "untested_rest",
+        "tests",
+        "rest_gap",
+        _untested_rest,
+        sentences.UNTESTED_REST,
+        "A detent holds a joint that rests there, and no run that slides past it or leaves it fast shows that.",
+        _in_the_stretch,
     ),
     Check(
         "unexplained",

@@ -24,8 +24,17 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 
-_LARGEST = 0.9  # gain or loss of one bet on unbounded differences, as a share of the wealth
-_FEW = 4  # with fewer earlier tasks, all of them count as recent
+
+@dataclass(frozen=True)
+class BetSettings:
+    """How bets on the differences of two models are placed."""
+
+    largest: float = 0.9  #: gain or loss of one bet on unbounded differences, as a share of the wealth
+    few: int = 4  #: with fewer earlier tasks, all of them count as recent
+
+
+BETS = BetSettings()
+"""The settings in use."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +101,7 @@ def mean_difference(differences: PairedDifferences, beta: float) -> MeanDifferen
     centre = float(np.average(corrected, weights=weights) if weights.any() else corrected.mean())
     low, high = (_end(differences, centre, level, above=above) for above in (True, False))
     spread = float(differences.values.var())
-    left = min(1.0, float(corrected[count // 2 :].var()) / spread) if count > _FEW and spread > 0 else None
+    left = min(1.0, float(corrected[count // 2 :].var()) / spread) if count > BETS.few and spread > 0 else None
     estimate = float(np.clip(centre, low, high))
     return MeanDifference(estimate, low, high, sign, after, count, left)
 
@@ -105,13 +114,13 @@ def _by_symmetry(centred: Array, *, recent: bool) -> Array:
         scale = _recent_size(centred) if recent else of_all
         bets = np.sqrt(2 * np.log(20.0) / (np.maximum(before, 1) * np.log1p(np.maximum(before, 1)))) / scale
     gain = np.where(np.isfinite(bets), bets, 0.0) * centred
-    return np.asarray(np.cumsum(np.log1p(_LARGEST * np.tanh(gain / _LARGEST)), axis=-1))
+    return np.asarray(np.cumsum(np.log1p(BETS.largest * np.tanh(gain / BETS.largest)), axis=-1))
 
 
 def _recent_sum(values: Array) -> Array:
     """Return for each task the sum over the later half of the earlier tasks, ``(..., N)``; over all if they are few."""
     ends = np.arange(values.shape[-1])
-    starts = np.where(ends >= _FEW, ends // 2, 0)
+    starts = np.where(ends >= BETS.few, ends // 2, 0)
     sums = np.concatenate([np.zeros((*values.shape[:-1], 1)), np.cumsum(values, axis=-1)], axis=-1)
     return np.asarray(sums[..., ends] - sums[..., starts])
 

@@ -40,8 +40,7 @@ from ctxval._util.texts import enumerated
 from ctxval.certificates.checks import CHECKS
 from ctxval.certificates.drawn_distances import FLOOR, LARGEST, DrawnDistances
 from ctxval.certificates.envelope_shape import (
-    MANY,
-    MULTIPLES,
+    SHAPE,
     Surfaces,
     TrustedRegion,
     exported,
@@ -55,13 +54,24 @@ from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TaskSuite
 from ctxval.errors import InputError
 
-COUNTED = 4096  # tasks of which the share in the envelope is counted
-_EXCEEDED = 1.02  # an executed distance above the threshold counts as at least this multiple of it
+
+@dataclass(frozen=True)
+class EnvelopeSettings:
+    """How an envelope is computed and counted."""
+
+    counted: int = 4096  #: tasks of which the share in the envelope is counted
+    exceeded: float = 1.02  #: an executed distance above the threshold counts as at least this multiple of it
+    others: int = 32  #: tasks outside of the interpolated set that are counted if nothing checks this
+    block: int = 256  #: tasks whose closed loops are run together
+    worth: float = 0.8  #: share of the tasks predicted below the threshold that tests may leave in the envelope
+
+
+ENVELOPE = EnvelopeSettings()
+"""The settings in use."""
+
+
 _SAME = 1e-9
 _SAME_TASK = 1e-6
-_OTHERS = 32  # tasks outside of the interpolated set that are counted if nothing checks this
-_BLOCK = 256  # tasks whose closed loops are run together
-_WORTH = 0.8  # share of the tasks predicted below the threshold that tests may leave in the envelope
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +263,7 @@ def must_outlive_a_test(drawn: DrawnDistances, evidence: Evidence, threshold: fl
     """Return whether a drawn test raises k by so much that the tests of another hypercube are worth while."""
     largest = max((rise for rise, test in rises_of(evidence, threshold) if test.origin in DRAWN), default=0.0)
     kept = drawn.mean + largest * drawn.spread(threshold) <= threshold
-    return bool(kept.sum() < _WORTH * (drawn.mean <= threshold).sum())
+    return bool(kept.sum() < ENVELOPE.worth * (drawn.mean <= threshold).sum())
 
 
 def _interpolated(
@@ -269,7 +279,7 @@ def _interpolated(
     for point, distance in executed:
         if distance > threshold and evidence.quantile is None:
             far = np.abs(points - point).max(axis=1) > _SAME_TASK
-            ratio = float(np.clip(distance / threshold, _EXCEEDED, LARGEST))
+            ratio = float(np.clip(distance / threshold, ENVELOPE.exceeded, LARGEST))
             points = np.concatenate([points[far], point[None]])
             values = np.concatenate([values[far], [[ratio, 0.0, 0.0, 0.0]]])
     _, rows = np.unique(points.round(9), axis=0, return_index=True)
@@ -319,9 +329,9 @@ def envelope_of(
         envelope = _of_suite(envelope, space, drawn, evidence.most_beyond, executed)
     else:
         surfaces = _interpolated(drawn, evidence, threshold, factor, executed)
-        tasks, least = space.unit_draws(COUNTED, np.random.default_rng(2)), surfaces
-        if checks >= MANY:
-            least = surfaces.with_errors(MULTIPLES[0])
+        tasks, least = space.unit_draws(ENVELOPE.counted, np.random.default_rng(2)), surfaces
+        if checks >= SHAPE.many:
+            least = surfaces.with_errors(SHAPE.multiples[0])
         tasks = tasks[(least(tasks) <= 1).all(axis=1)][:checks]
         if evaluate is not None and len(tasks):
             checked = evaluate(tasks)
@@ -329,14 +339,14 @@ def envelope_of(
             surfaces = surfaces.without(tasks[outside], len(tasks))
             envelope = replace(envelope, checks=len(tasks))
         envelope = replace(envelope, margin=float(np.median(surfaces.errors[:, 0])), _surfaces=surfaces)
-        tasks = space.unit_draws(COUNTED, np.random.default_rng(0))
+        tasks = space.unit_draws(ENVELOPE.counted, np.random.default_rng(0))
         inside = np.isfinite(envelope.bound_at(tasks))
         regions = regions_inside(space, tasks, inside, lambda unit: np.isfinite(envelope.bound_at(unit)))
         share = float(inside.mean())
         uncovered = float(((surfaces(tasks)[:, 0] <= 1) & ~inside).mean())
         envelope = replace(envelope, share=share, interpolated=share, regions=regions, uncovered=uncovered)
         if evaluate is not None:
-            others = tasks[~inside][: checks // 2 or _OTHERS]
+            others = tasks[~inside][: checks // 2 or ENVELOPE.others]
             envelope = _with_loops(envelope, evaluate, evidence.most_beyond, executed, others)
     return replace(envelope, statement=envelope_statement(envelope))
 
@@ -354,8 +364,8 @@ def _with_loops(
 
     def by_loops(points: Array) -> Array:
         blocks = [np.zeros(0)]
-        for first in range(0, len(points), _BLOCK):
-            drawn = evaluate(points[first : first + _BLOCK])
+        for first in range(0, len(points), ENVELOPE.block):
+            drawn = evaluate(points[first : first + ENVELOPE.block])
             upper = drawn.upper(factor, threshold)
             blocks.append(np.where((upper <= 1) & (drawn.leaving(most) <= 1), np.maximum(upper, 0), np.inf))
         return np.concatenate(blocks)

@@ -27,18 +27,32 @@ from ctxval._util.files import MADE_BY
 from ctxval._util.texts import parted
 from ctxval.core.space import TaskSpace
 
-ENOUGH = 1.2  # multiple of the limit up to which an error of what exceeds it matters
-FALSE = 0.005  # share of the checked points that may be below the limit falsely
-MANY = 256  # checked points from which on errors may also turn out to be too large: then multiples are below 1
-MULTIPLES = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # of the errors
-_SCALED = 500  # tasks by which scales are chosen
-_SCALES = 0.02, 50.0  # smallest and largest one
-_NUGGET = 1e-9  # added to the matrix, so that two tasks that are nearly the same do not make it singular
-REGIONS = 3  # largest number of regions
-LEAST = 0.02  # least share of the tasks that a region holds and no larger one
 _SEEDS, _BEST = 100, 10  # tasks from which boxes grow, and those from which they grow again
-_CHECKED = 2000  # tasks in a box that must all lie inside the set
-_ROUNDS = 30  # times that boxes may grow again, each time to a smaller share of the way to tasks outside
+
+
+@dataclass(frozen=True)
+class ShapeSettings:
+    """How the set of tasks is interpolated, and how boxes in it are found."""
+
+    enough: float = 1.2  #: multiple of the limit up to which an error of what exceeds it matters
+    false: float = 0.005  #: share of the checked points that may be below the limit falsely
+    #: checked points from which on errors may also turn out to be too large: then multiples are below 1
+    many: int = 256
+    #: of the errors
+    multiples: tuple[float, ...] = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
+    scaled: int = 500  #: tasks by which scales are chosen
+    scales: tuple[float, ...] = (0.02, 50.0)  #: smallest and largest one
+    nugget: float = 1e-9  #: added to the matrix, so that two tasks that are nearly the same do not make it singular
+    regions: int = 3  #: largest number of regions
+    least: float = 0.02  #: least share of the tasks that a region holds and no larger one
+    checked: int = 2000  #: tasks in a box that must all lie inside the set
+    rounds: int = 30  #: times that boxes may grow again, each time to a smaller share of the way to tasks outside
+
+
+SHAPE = ShapeSettings()
+"""The settings in use."""
+
+
 _DIGITS = 3
 
 
@@ -73,7 +87,7 @@ class Surfaces:
     def through(cls, points: Array, values: Array, scales: Array | None = None) -> Surfaces:
         """Return the surfaces of values ``(K, c)`` at different points ``(K, d)``, K at least d + 2.
 
-        The values are shares of a limit. How far they exceed it does not matter, so an error counts up to ``ENOUGH``.
+        The values are shares of a limit. How far they exceed it does not matter: errors count up to ``SHAPE.enough``.
         If no scales are given, they are chosen.
         """
         K, d = points.shape
@@ -82,12 +96,12 @@ class Surfaces:
         points = points * scales
         tail = np.concatenate([np.ones((K, 1)), points], axis=1)
         matrix = np.zeros((K + 1 + d, K + 1 + d))
-        matrix[:K, :K] = cdist(points, points) ** 3 + _NUGGET * np.eye(K)
+        matrix[:K, :K] = cdist(points, points) ** 3 + SHAPE.nugget * np.eye(K)
         matrix[:K, K:], matrix[K:, :K] = tail, tail.T
         inverse = np.linalg.inv(matrix)
         weights = inverse[:, :K] @ values
         left_out = values - weights[:K] / np.diag(inverse)[:K, None]
-        errors = np.abs(np.minimum(values, ENOUGH) - np.minimum(left_out, ENOUGH))
+        errors = np.abs(np.minimum(values, SHAPE.enough) - np.minimum(left_out, SHAPE.enough))
         return cls(scales, points, weights, left_out, errors)
 
     def without(self, outside: Array, checked: int) -> Surfaces:
@@ -95,9 +109,9 @@ class Surfaces:
 
         The points are those of ``checked`` ones that lie outside of the set.
         """
-        for multiple in MULTIPLES if checked >= MANY else MULTIPLES[MULTIPLES.index(1.0) :]:
+        for multiple in SHAPE.multiples if checked >= SHAPE.many else SHAPE.multiples[SHAPE.multiples.index(1.0) :]:
             raised = self.with_errors(multiple)
-            if (raised(outside) <= 1).all(axis=-1).sum() <= FALSE * checked:
+            if (raised(outside) <= 1).all(axis=-1).sum() <= SHAPE.false * checked:
                 break
         return raised
 
@@ -114,7 +128,7 @@ class Surfaces:
 
 def _scales(points: Array, values: Array) -> Array:
     """Return scales ``(d,)`` with small errors: one after the other is doubled or halved while these fall."""
-    rows = np.random.default_rng(0).permutation(len(points))[:_SCALED]
+    rows = np.random.default_rng(0).permutation(len(points))[: SHAPE.scaled]
     points, values = points[rows], values[rows]
 
     def error(scales: Array) -> float:
@@ -126,7 +140,7 @@ def _scales(points: Array, values: Array) -> Array:
         while True:
             tried = scales.copy()
             tried[j] *= factor
-            if not _SCALES[0] < tried[j] < _SCALES[1] or (smaller := error(tried)) > 0.995 * least:
+            if not SHAPE.scales[0] < tried[j] < SHAPE.scales[1] or (smaller := error(tried)) > 0.995 * least:
                 break
             scales, least = tried, smaller
     return scales
@@ -263,13 +277,13 @@ def regions_inside(
     corners = np.sort([sides * space.low, sides * space.high], axis=0)
     ends = corners.sum(axis=2)  # the smallest and the largest value of each side in the task space, (2, m)
     outside, left, regions = values[~inside], inside.copy(), []
-    for _ in range(REGIONS):
+    for _ in range(SHAPE.regions):
         seeds = np.flatnonzero(left)
-        if len(seeds) < LEAST * len(unit):
+        if len(seeds) < SHAPE.least * len(unit):
             break
         seeds = rng.permutation(seeds)[:_SEEDS]
         speeds = np.exp(rng.normal(scale=1.5, size=(len(seeds), len(labels))))
-        for k in range(_ROUNDS):
+        for k in range(SHAPE.rounds):
             reach = 0.98 - 0.02 * k
             grown = [_grown(values[s], outside, ends, v, reach) for s, v in zip(seeds, speeds, strict=True)]
             counts = np.array([(left & _within(values, box)).sum() for box in grown])
@@ -284,7 +298,7 @@ def regions_inside(
         else:
             break
         held = _within(values, box)
-        if (held & left).sum() < LEAST * len(unit):
+        if (held & left).sum() < SHAPE.least * len(unit):
             break
         limits = {}
         for label, (low, high), (first, last) in zip(labels, box.T, ends.T, strict=True):
@@ -344,9 +358,9 @@ def _tasks_within(space: TaskSpace, sides: Array, box: Array, rng: np.random.Gen
     """Return tasks in a box, points of the unit cube ``(n, d)``, of which many lie on its sides."""
     d = space.dimension
     low, high = np.maximum(box[0, :d], space.low), np.minimum(box[1, :d], space.high)
-    shares = rng.random((4 * _CHECKED, d))
+    shares = rng.random((4 * SHAPE.checked, d))
     on_sides = rng.random(shares.shape) < rng.random((len(shares), 1))
     on_sides[::2] = False
     points = low + np.where(on_sides, np.round(shares), shares) * (high - low)
-    kept = points[_within(points @ sides.T, box)][:_CHECKED]
+    kept = points[_within(points @ sides.T, box)][: SHAPE.checked]
     return np.clip(space.to_unit(kept), 0, 1)

@@ -16,7 +16,7 @@ from ctxval.certificates.explained import ExplainedExecution
 from ctxval.certificates.limits import LIMITS, CheckLimits
 from ctxval.certificates.prediction_tests import MANY, TESTS
 from ctxval.certificates.predictions import CheckedPrediction, latest_tests
-from ctxval.core.coverage import StateInputCoverage, UnsampledCorner, UnsampledParameter, UnvisitedRegion
+from ctxval.core.coverage import StateInputCoverage, UnsampledCorner, UnsampledParameter, UntestedRest, UnvisitedRegion
 from ctxval.core.learned_numbers import PushedDistances
 
 
@@ -65,8 +65,10 @@ class Evidence(ShortRepr):
     drift: tuple[str, float] | None = None  #: with what effects of executions change, and its p-value; None without any
     #: of friction at rest, by how many times a force that a joint withstood exceeds one that moved it elsewhere
     uneven: float = 1.0
+    untested_rest: UntestedRest | None = None  #: where friction at rest was not tested; None without dry friction
     #: the largest distance under errors of M as small as all that were recorded; 0 if such errors are learned
     negligible: float = 0.0
+    replaced: tuple[str, ...] = ()  #: stages that were left out, or replaced by cheaper ones, for lack of time
     # The question
     best: float = 0.0  #: the largest executed distance
     worst: tuple[float, ...] = ()  #: its task, a point of the unit cube ``(d,)``; empty if it is not known

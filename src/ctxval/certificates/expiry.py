@@ -42,24 +42,32 @@ from ctxval.certificates.sentences import withdrawals
 from ctxval.core.learned_numbers import Statistic
 from ctxval.errors import InputError
 
+
+@dataclass(frozen=True)
+class ChangeSettings:
+    """How later runs are compared with certified ones."""
+
+    #: evidence from which runs are not said to agree with the certified ones: that of a single test at level 0.05
+    suspected: float = 20.0
+    #: alternatives c for the scale of a changed statistic, of equal weight
+    scales: Array = field(default_factory=lambda: np.array([1.3, 1.6, 2.0, 3.0, 4.0, 8.0, 30.0, 100.0]))
+    #: alternatives for the variance of changed coefficients, relative to what the certified runs left uncertain
+    wider: tuple[float, ...] = (3.0, 10.0, 30.0, 100.0)
+    #: m; more would call statistics that a floor makes equal surprising
+    freedoms: Array = field(default_factory=lambda: np.geomspace(0.25, 64.0, 17))
+    outliers: float = 0.005  #: share of runs that may be anything although nothing has changed
+    window: int = 200  #: latest runs at which a change may have begun; fewer starts make the sum smaller
+
+
+CHANGES = ChangeSettings()
+"""The settings in use."""
+
+
 EXCEEDED = "distances above the threshold"
 """Cause of an alarm that needs no evidence: without noise, an executed distance above the threshold is a fact."""
 
-SUSPECTED = 20.0
-"""Evidence from which runs are not said to agree with the certified ones: that of a single test at level 0.05."""
-
 FEWEST = 3
 """Fewest certified runs from which later ones are judged."""
-
-SCALES = np.array([1.3, 1.6, 2.0, 3.0, 4.0, 8.0, 30.0, 100.0])
-"""Alternatives c for the scale of a changed statistic, of equal weight."""
-
-WIDER = np.array([3.0, 10.0, 30.0, 100.0])
-"""Alternatives for the variance of changed coefficients, relative to what the certified runs left uncertain."""
-
-_FREEDOMS = np.geomspace(0.25, 64.0, 17)  # m; more would call statistics that a floor makes equal surprising
-_OUTLIERS = 0.005  # share of runs that may be anything although nothing has changed
-_WINDOW = 200  # latest runs at which a change may have begun; fewer starts make the sum smaller
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,12 +81,12 @@ class KnownStatistics:
     freedom: float | None  #: the degrees of freedom that noise gives them; None if nothing is known beforehand
 
     def _log_evidence(self) -> Array:
-        a, K, k = 0.5 * _FREEDOMS, self.count, 0.0
+        a, K, k = 0.5 * CHANGES.freedoms, self.count, 0.0
         prior = np.zeros(len(a))
         if self.freedom is not None:
             k = 40.0  # runs that prior knowledge of noise weighs as much as
             # Standard deviation of the logarithm of m around what is known beforehand.
-            prior = a * k * math.log(k) - gammaln(a * k) - 0.5 * (np.log(_FREEDOMS / self.freedom) / 0.5) ** 2
+            prior = a * k * math.log(k) - gammaln(a * k) - 0.5 * (np.log(CHANGES.freedoms / self.freedom) / 0.5) ** 2
         scale = -a * (K + k) * np.log(self.sums + k)[..., None]
         return np.asarray(prior + gammaln(a * (K + k)) - K * gammaln(a) + scale + a * self.logs[..., None])
 
@@ -107,22 +115,22 @@ class ScaleBets:
     @classmethod
     def before(cls, certified: Sequence[float], freedom: float | None) -> ScaleBets:
         """Return the bets before the first later run."""
-        none, K = np.empty((len(SCALES), 0)), len(certified)
+        none, K = np.empty((len(CHANGES.scales), 0)), len(certified)
         base = KnownStatistics(np.array(math.fsum(certified)), np.log(certified).sum(), K, freedom)
         nothing = KnownStatistics(none, none, K, freedom)
         return cls(none, base, nothing, nothing)
 
     def after(self, value: float) -> ScaleBets:
         """Return the bets after another run."""
-        squares = (SCALES**2)[:, None]
+        squares = (CHANGES.scales**2)[:, None]
         same, changed = self._with_start(self.same), self._with_start(self.changed)
         products = _appended(self.products, 0.0)
         smaller = value / np.broadcast_to(squares, products.shape)
-        ordinary = same.log_density(np.full_like(products, value)) + math.log(1 - _OUTLIERS)
+        ordinary = same.log_density(np.full_like(products, value)) + math.log(1 - CHANGES.outliers)
         other = changed.log_density(smaller)
-        either = np.logaddexp(ordinary, other + math.log(_OUTLIERS))
+        either = np.logaddexp(ordinary, other + math.log(CHANGES.outliers))
         # An outlier teaches what it would be if it were none, so that another one is as surprising.
-        outlying = np.exp(other + math.log(_OUTLIERS) - either)
+        outlying = np.exp(other + math.log(CHANGES.outliers) - either)
         of_start = outlying[:, -1]
         usual = math.log(value) - of_start.mean() * (of_start @ np.log(squares[:, 0])) / max(of_start.sum(), 1e-300)
         return ScaleBets(
@@ -138,7 +146,7 @@ class ScaleBets:
 
 
 def _appended(array: Array, value: float | Array) -> Array:
-    return np.concatenate([array, np.full((len(array), 1), value)], axis=1)[:, -_WINDOW:]
+    return np.concatenate([array, np.full((len(array), 1), value)], axis=1)[:, -CHANGES.window :]
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,18 +165,18 @@ class SlopeBets:
         """Return the bets before the first later run, from the information ``(k, k)`` of the certified ones."""
         k = len(certified)
         known = certified / scale + 1e-9 * max(float(np.trace(certified)), 1e-300) * np.eye(k)
-        priors = known / np.array([1.0, *WIDER])[:, None, None]
-        return cls(np.empty((len(WIDER), 0)), np.empty((0, k)), np.empty((0, k, k)), priors, scale)
+        priors = known / np.array([1.0, *CHANGES.wider])[:, None, None]
+        return cls(np.empty((len(CHANGES.wider), 0)), np.empty((0, k)), np.empty((0, k, k)), priors, scale)
 
     def after(self, gradient: Array, information: Array) -> SlopeBets:
         """Return the bets after another run, whose likelihood is ``exp(w' gradient - w' information w / 2)``."""
         products = _appended(self.products, 0.0)
-        gradients = np.pad(self.gradients, ((0, 1), (0, 0)))[-_WINDOW:]
-        informations = np.pad(self.informations, ((0, 1), (0, 0), (0, 0)))[-_WINDOW:]
+        gradients = np.pad(self.gradients, ((0, 1), (0, 0)))[-CHANGES.window :]
+        informations = np.pad(self.informations, ((0, 1), (0, 0), (0, 0)))[-CHANGES.window :]
         before = self._ratios(gradients, informations)
         gradients, informations = gradients + gradient / self.scale, informations + information / self.scale
         change = self._ratios(gradients, informations) - before
-        bets = change - np.logaddexp(math.log(1 - _OUTLIERS), math.log(_OUTLIERS) + change)
+        bets = change - np.logaddexp(math.log(1 - CHANGES.outliers), math.log(CHANGES.outliers) + change)
         return replace(self, products=products + bets, gradients=gradients, informations=informations)
 
     def _ratios(self, gradients: Array, informations: Array) -> Array:
@@ -209,9 +217,9 @@ class WatchedChannel(ShortRepr):
         """Return the logarithm of the sum over all starts, and the run, counted from 1, at which it is likeliest."""
         if self._scales is None:
             return -math.inf, 1
-        of_starts = np.logaddexp.reduce(self._scales.products, axis=0) - math.log(len(SCALES))
+        of_starts = np.logaddexp.reduce(self._scales.products, axis=0) - math.log(len(CHANGES.scales))
         if self._slopes is not None:
-            of_slopes = np.logaddexp.reduce(self._slopes.products, axis=0) - math.log(len(WIDER))
+            of_slopes = np.logaddexp.reduce(self._slopes.products, axis=0) - math.log(len(CHANGES.wider))
             of_starts = np.logaddexp(of_starts, of_slopes) - math.log(2)
         known = [k for k, statistic in enumerate(self.later) if statistic is not None][-len(of_starts) :]
         return float(np.logaddexp.reduce(of_starts)), known[int(of_starts.argmax())] + 1
@@ -281,7 +289,7 @@ class WatchState(ShortRepr):
             distance = self.distances[self.alarm - 1]
             return withdrawals.EXCEEDED.format(run=self.alarm, distance=distance, threshold=self.threshold)
         against = {"evidence": self.evidence, "limit": 1 / self.false_alarms}
-        if self.ratio is not None and (self.expired or self.evidence >= SUSPECTED):
+        if self.ratio is not None and (self.expired or self.evidence >= CHANGES.suspected):
             times = f"{self.ratio:.2g}" if self.ratio < 100 else f"{self.ratio:.0f}"
             text = withdrawals.CHANGED if self.expired else withdrawals.SUSPECTED
             return text.format(cause=self.cause, since=self.since, times=times, **against)

@@ -25,10 +25,9 @@ import scipy
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
+from ctxval.certificates.limits import LIMITS
 from ctxval.core.quantiles import chance_of_more
 
-CONTRADICTED = 5.0  # e-value from which the law does not explain the executions; of a true law, 1 of 100 exceeds it
-LEVERAGE = 0.5  # least predicted distance, as a share of the bound, from which an execution tells of the threshold
 _SHARES = (0.05, 0.1, 0.2, 0.4)
 _LEVELS = (0.005, 0.02, 0.1)
 
@@ -80,7 +79,7 @@ def support_of(executions: Sequence[ExplainedExecution], level: float, bound: fl
     """Return the likelihood ratio of the law against the hypothesis that a share ``1 - quantile`` exceeds a level."""
     ratio = 1.0
     for each in executions:
-        if not each.quantiles or (each.distance <= level and each.expected < LEVERAGE * bound):
+        if not each.quantiles or (each.distance <= level and each.expected < LIMITS.leverage * bound):
             continue
         chance = min(each.chance_of_more(level), 1 - quantile)
         ratio *= chance / (1 - quantile) if each.distance > level else (1 - chance) / quantile

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ctxval.core.coverage import UntestedRest
+
 
 @dataclass(frozen=True)
 class CheckLimits:
@@ -48,9 +50,15 @@ class CheckLimits:
 
     # What the final law must explain
     contradicted: float = 5.0  #: e-value of all executions against the noise; true noise exceeds it in 1 of 100
+    leverage: float = 0.5  #: least predicted share of the bound from which an execution tells of the threshold
     drifting: float = 0.005  #: p-value below which effects of executions change with their order or with a parameter
+    rest_gap: float = UntestedRest.MOST  #: stretch without a test of friction at rest, as a share
     uneven: float = 1.5  #: ratio of a force that a joint at rest withstood to one that moved it elsewhere
     supported: float = 1.0  #: least likelihood ratio of the noise against a share of executions above the threshold
+
+    # Remedies
+    near: float = 0.7  #: share of the way from the largest distance to the threshold from which a draw is near it
+    repetitions: int = 4  #: executions of a task that are chosen because one execution does not explain it
 
     # Whether a search can find the maximum
     peak_ratio: float = 0.05  #: share by which a maximum may exceed the median of nearly the same tasks

@@ -21,11 +21,23 @@ from ctxval.errors import CertificateError
 from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters, draw_paths, maxima
 from ctxval.gp.surrogate import kept_rows
 
-FEWEST = 4  # trials for a bound
-MOST = 160  # trials that a process is conditioned on; the effort of a draw grows with its cube
-STOCHASTIC = (1e-6, 1.0)  # bounds of the noise variance of a stochastic system, relative to that of the distance
+
+@dataclass(frozen=True)
+class MaximaSettings:
+    """How maxima of the process are drawn."""
+
+    fewest: int = 4  #: trials for a bound
+    most: int = 160  #: trials that a process is conditioned on; the effort of a draw grows with its cube
+    #: bounds of the noise variance of a stochastic system, relative to that of the distance
+    stochastic: tuple[float, float] = (1e-6, 1.0)
+    chains: int = 4  #: those of a bound near a threshold; one chain is usual
+
+
+MAXIMA = MaximaSettings()
+"""The settings in use."""
+
+
 _EXTREME = 1e100  # largest distance, and inverse of the smallest difference: their squares must be finite
-_MOST = 4  # chains for a bound near a threshold; one chain is usual
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +102,7 @@ def draw_maxima(
     rng = np.random.default_rng(seed)
     # No logarithm with noise: the exponential of an expected logarithm is not the expected distance.
     # No second chain on well-spread trials: only all trials together can separate noise from roughness.
-    believed = prior or (Prior(noise=STOCHASTIC, offset=None, spread_share=1.0) if stochastic else Prior())
+    believed = prior or (Prior(noise=MAXIMA.stochastic, offset=None, spread_share=1.0) if stochastic else Prior())
     best_first = X[np.argsort(-y, kind="stable")]
     with single_threaded(), stage("drawing the largest distance", draws * paths, "draws"):
         conditioned = draw_hyperparameters(X, y, draws, rng, believed)
@@ -111,14 +123,14 @@ def draw_maxima(
 
 def representative(sample: Sample) -> Sample:
     """Return the trials that the process is conditioned on: of many, the largest, latest and well-spread ones."""
-    return sample.rows(kept_rows(sample.points, sample.distances, MOST, MOST + 1).tolist())
+    return sample.rows(kept_rows(sample.points, sample.distances, MAXIMA.most, MAXIMA.most + 1).tolist())
 
 
 def settle_maxima(sample: Sample, threshold: float, confidence: float) -> Maxima:
     """Return draws of d*, up to four times as many while the threshold is within two standard errors of the bound."""
     pooled = draw_maxima(sample)
     chains = [pooled]
-    while len(chains) < _MOST and abs(pooled.upper(confidence) - threshold) < ERRORS * pooled.error(confidence):
+    while len(chains) < MAXIMA.chains and abs(pooled.upper(confidence) - threshold) < ERRORS * pooled.error(confidence):
         more = range(len(chains), 2 * len(chains))
         chains += [draw_maxima(sample, seed=1_000_003 * chain) for chain in more]
         draws, points = (np.concatenate([getattr(chain, name) for chain in chains]) for name in ("draws", "points"))
@@ -143,8 +155,8 @@ def _require_bounding(sample: Sample) -> None:
         raise CertificateError(
             f"the distance of some task is unknown, so nothing bounds d*.{advice_to_remeasure(sample)}"
         )
-    if len(sample) < FEWEST:
-        raise CertificateError(f"a posterior bound needs at least {FEWEST} trials, got {len(sample)}.")
+    if len(sample) < MAXIMA.fewest:
+        raise CertificateError(f"a posterior bound needs at least {MAXIMA.fewest} trials, got {len(sample)}.")
     spread, largest = float(np.ptp(sample.distances)), float(np.abs(sample.distances).max())
     if spread == 0:
         raise CertificateError(

@@ -25,7 +25,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, farthest_task, resolved_volume
 from ctxval.certificates.forecast import forecast
-from ctxval.certificates.maxima import MOST, Maxima, draw_maxima, representative, settle_maxima
+from ctxval.certificates.maxima import MAXIMA, Maxima, draw_maxima, representative, settle_maxima
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences import statements, withdrawals
 from ctxval.errors import CertificateError, InputError
@@ -54,7 +54,7 @@ class DistanceBound(CertificateKind):
         threshold = sample.threshold
         far = (farthest := farthest_task(sample.points)) > self.resolution
         # Many trials that do not cover the tasks are refused before the draws, which take long.
-        if far and len(sample) > MOST:
+        if far and len(sample) > MAXIMA.most:
             raise CertificateError(
                 f"some task is {farthest:.2g} of the task space's diagonal away from each of {len(sample)} trials, "
                 f"more than the resolution of {self.resolution:g}, so the bound would be withdrawn and is not "

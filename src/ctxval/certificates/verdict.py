@@ -40,6 +40,7 @@ class Verdict:
     remarks: tuple[str, ...] = ()  #: what the reason says beside the statement of a validation
     conditions: tuple[str, ...] = ()  #: the conditions of a validation, each as the end of "It rests on ..."
     next_task: Mapping[str, Any] | None = None  #: the task to execute next, if learned dynamics choose it; else None
+    shortage: Mapping[str, Any] | None = None  #: the code and the seconds of thinking that are missing; else None
 
     @property
     def bound(self) -> float | None:
@@ -65,7 +66,8 @@ class Verdict:
     def to_json(self) -> dict[str, Any]:
         """Return the answer and its reasons, ready for JSON; the certificate has its own."""
         names = ("reason", "rests_on", "threshold", "next_task")
-        return {"verdict": self.answer, **{name: getattr(self, name) for name in names}}
+        thinking = {} if self.shortage is None else {"thinking": dict(self.shortage)}
+        return {"verdict": self.answer, **{name: getattr(self, name) for name in names}, **thinking}
 
 
 @checked

@@ -64,9 +64,9 @@ def ask(
         waiting = campaign.reopen(trial)
     elif limit is not None and not stated and (limits.threshold is not None or not settings.explores):
         certificate = settings.certificate_options
-        asked = campaign.ask_for_verdict(limit, total, certificate=certificate, wait=_WAIT)
+        asked = campaign.ask_for_verdict(limit, total, certificate=certificate, thinking=settings.thinking, wait=_WAIT)
         if asked is None:
-            verdict = campaign.verdict(limit, certificate=certificate)
+            verdict = campaign.verdict(limit, certificate=certificate, thinking=settings.thinking)
             print_verdict(verdict)
             if verdict.answer == "undecided" and not campaign.recorder.has_tasks:
                 out.say("each task of the suite is executed or open: --set task=NAME opens one of them again.")

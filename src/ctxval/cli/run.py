@@ -44,6 +44,7 @@ def run(
     explore: bool | None = None,
     envelope: bool = False,
     within: float | None = None,
+    thinking: float | None = None,
     tests: int | None = None,
     quantile: float | None = None,
     resolution: float | None = None,
@@ -55,7 +56,13 @@ def run(
     live: bool = False,
     option: list[str] | None = None,
 ) -> Any:
-    stated = {"confidence": confidence, "explore": explore, "within": within, "options": named_values(option)}
+    stated = {
+        "confidence": confidence,
+        "explore": explore,
+        "within": within,
+        "thinking": thinking,
+        "options": named_values(option),
+    }
     settings = read_settings(target, {**vars(made), **vars(limits), **stated})
     settings = settings.certified_as({"resolution": resolution, "tests": tests, "quantile": quantile})
     experiment, certificate = settings.load(), settings.certificate_options
@@ -82,12 +89,15 @@ def run(
                 envelope=envelope,
                 within=settings.within,
                 certificate=certificate,
+                thinking=settings.thinking,
                 again=again_failed,
                 **pool,
             )
         known = experiment.truth() if truth and experiment.truth is not None else None
         digest = campaign.store.digest()
-        verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
+        verdict = (
+            None if limit is None else campaign.verdict(limit, certificate=certificate, thinking=settings.thinking)
+        )
         bound = None if verdict is None else verdict.certificate
         if verdict is None and not settings.explores:
             with suppress(CertificateError):

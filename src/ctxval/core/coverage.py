@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
@@ -61,3 +62,22 @@ class UnsampledParameter(ShortRepr):
     gap: float  #: the largest distance of one of its values to the nearest executed one, as a share of its range
     task: Array  #: a task in that gap, a point of the unit cube ``(d,)``
     idle: bool = False  #: whether a parameter of this kind changes no predicted distance either; not of a suite
+
+
+@dataclass(frozen=True)
+class UntestedRest:
+    """The longest stretch of places in which no execution tested friction at rest.
+
+    An execution tests a place if a joint leaves rest there under a force that is little above usual friction at rest.
+    """
+
+    MOST: ClassVar[float] = 0.105  #: the largest size that is allowed: nine tested places leave 10 %
+
+    size: float  #: its length, as a share of the range in which joints leave rest
+    place: dict[str, float]  #: a place in it, by the label of the joint's coordinate, in its unit
+    length: float  #: its length, in this unit
+    force: float  #: the largest force that tests a place, in the unit of the input
+    times: float  #: multiple of the usual friction at rest that the stretch may hold with
+    highest: float  #: the largest predicted distance if every place holds with so much; infinity if it is not known
+    #: tasks whose predicted runs leave rest in the stretch under a force that tests it, points of the unit cube
+    tasks: tuple[tuple[float, ...], ...] = ()

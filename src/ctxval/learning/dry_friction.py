@@ -48,7 +48,20 @@ class FrictionSettings:
     rounds: int = 2  # the residual is evaluated at forces that follow from it
     sweeps: int = 4  # each time, of the inputs, whose frictions act on each other's rates
     slips: int = 3  # times that the friction of a joint that slips follows from its rate
+    integral: float = 0.99  # least correlation of a rate with the changes of its integral
     newton_steps: int = 4  # steps to the forces that recorded steps had
+
+
+@dataclass(frozen=True, eq=False)
+class Pushes:
+    """What acts on m joints in N steps, and what they do; arrays have the shape ``(N, m)``."""
+
+    force: Array  # what friction must withstand to hold a joint, without its part that grows with the input
+    up: Mask  # whether it pushes above 0
+    held: Mask  # whether the joint stays at rest
+    started: Mask  # whether it leaves rest
+    turned: Mask  # whether it turns, and moves before and afterwards
+    errors: Array  # the usual errors of these forces (m,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,13 +130,10 @@ class DryFriction:
         largest = self.sliding + self.load * np.abs(u)
         return largest + self.excess * _slowness(before, after, self.slow) if self.excess.any() else largest
 
-    def resting(self, transitions: Transitions, missed: Callable[[Array], Array]) -> tuple[Array, Array, Array, Array]:
-        """Return the least and the largest friction at rest, and that of turning joints, that transitions permit.
+    def pushes(self, transitions: Transitions, missed: Callable[[Array], Array], errors: Array | None = None) -> Pushes:
+        """Return what acts on joints in transitions if M misses ``missed(acting inputs)``.
 
-        Those at rest, against pushes below and above 0, have the shape ``(2, m)``, the third one ``(m,)``. M misses
-        ``missed(acting inputs)``. Friction that depends on the place or on the time at rest holds at one force and not
-        at a smaller one: then only larger forces that set a joint in motion count for the largest one. The last array
-        is the ratio ``(2, m)`` of the two forces; it is 1 if friction may be the same everywhere.
+        The errors of these forces ``(m,)`` follow from steps in which all joints move, if they are not given.
         """
         x, u, m = transitions.x, transitions.u, len(self.rates)
         before, after = x[:, self.rates], transitions.x_next[:, self.rates]
@@ -136,32 +146,64 @@ class DryFriction:
 
         for _ in range(self.settings.newton_steps):  # the frictions that these steps had
             force += (inverse * (rates_with(force) - after)[:, None]).sum(axis=2)
-        moves = _directions(transitions, self.rates, self.settings)
-        errors = np.abs(force - self._limits(u, before, after) * moves)[(moves != 0).all(axis=1)]
-        usual = self.settings.errors * np.median(errors, axis=0)
-        least, largest = np.stack([self.sliding] * 2), np.stack([np.abs(u).max(axis=0)] * 2)
+        if errors is None:
+            moves = _directions(transitions, self.rates, self.settings)
+            wrong = np.abs(force - self._limits(u, before, after) * moves)[(moves != 0).all(axis=1)]
+            errors = self.settings.errors * np.median(wrong, axis=0)
+        holding = np.repeat(force[None], m, axis=0)  # what would have kept each joint at its rate
+        for j in range(m):
+            holding[j, :, j] += (after - before)[:, j] / of_rates[:, j, j]
+            for _ in range(self.settings.newton_steps):
+                holding[j, :, j] += (rates_with(holding[j]) - before)[:, j] / of_rates[:, j, j]
+        held = np.stack([holding[j, :, j] for j in range(m)], axis=1)
+        withstood, own = np.abs(held) - self.load * np.abs(u), np.abs(np.diagonal(of_rates, axis1=1, axis2=2))
+        # A held joint creeps, and rates below what little of the force changes cannot be told apart.
+        little, creeping = np.maximum(errors, self.settings.withstood * withstood) * own, self.creep * withstood
+        slow, first, last = np.maximum(little, 2 * creeping), np.abs(before), np.abs(after)
+        return Pushes(
+            withstood,
+            up=held > 0,
+            held=np.maximum(first, last) <= np.maximum(little, creeping),
+            started=(first <= slow) & (last > np.maximum(2 * little, slow)),
+            turned=(before * after < 0) & (np.minimum(first, last) > slow),
+            errors=errors,
+        )
+
+    def resting(self, transitions: Transitions, pushes: Pushes) -> tuple[Array, Array, Array, Array]:
+        """Return the least and the largest friction at rest, and that of turning joints, that transitions permit.
+
+        Those at rest, against pushes below and above 0, have the shape ``(2, m)``, the third one ``(m,)``. Friction
+        that depends on the place or on the time at rest holds at one force and not at a smaller one: then only larger
+        forces that set a joint in motion count for the largest one. The last array
+        is the ratio ``(2, m)`` of the two forces; it is 1 if friction may be the same everywhere.
+        """
+        m = len(self.rates)
+        least, largest = np.stack([self.sliding] * 2), np.stack([np.abs(transitions.u).max(axis=0)] * 2)
         passed, uneven = np.full(m, np.inf), np.ones((2, m))
         for j in range(m):
-            holding = force.copy()  # what would have kept this joint at its rate
-            holding[:, j] += (after - before)[:, j] / of_rates[:, j, j]
-            for _ in range(self.settings.newton_steps):
-                holding[:, j] += (rates_with(holding) - before)[:, j] / of_rates[:, j, j]
-            withstood = np.abs(holding[:, j]) - self.load[j] * np.abs(u[:, j])
-            # A held joint creeps, and rates below what little of the force changes cannot be told apart.
-            little = np.maximum(usual[j], self.settings.withstood * withstood) * np.abs(of_rates[:, j, j])
-            creeping, first, last = self.creep[j] * withstood, np.abs(before[:, j]), np.abs(after[:, j])
-            slow, held = np.maximum(little, 2 * creeping), np.maximum(first, last) <= np.maximum(little, creeping)
-            for i, pushed in enumerate((holding[:, j] <= 0, holding[:, j] > 0)):
-                most = float(withstood[pushed & held].max(initial=0.0))
-                least[i, j] = max(self.sliding[j], most - usual[j])
-                started = pushed & (first <= slow) & (last > np.maximum(2 * little, slow))
+            withstood, usual = pushes.force[:, j], pushes.errors[j]
+            for i, pushed in enumerate((~pushes.up[:, j], pushes.up[:, j])):
+                most = float(withstood[pushed & pushes.held[:, j]].max(initial=0.0))
+                least[i, j] = max(self.sliding[j], most - usual)
+                started = pushed & pushes.started[:, j]
                 moved = withstood[started & (withstood > most)].min(initial=largest[i, j])
-                largest[i, j] = max(least[i, j], moved + usual[j])
-                smallest = withstood[started].min(initial=most) + 2 * usual[j]
+                largest[i, j] = max(least[i, j], moved + usual)
+                smallest = withstood[started].min(initial=most) + 2 * usual
                 uneven[i, j] = max(1.0, most / smallest if smallest > 0 else 1.0)
-            turned = ((before * after)[:, j] < 0) & (np.minimum(first, last) > slow)
-            passed[j] = withstood[turned].min(initial=np.inf) + usual[j]
+            passed[j] = withstood[pushes.turned[:, j]].min(initial=np.inf) + usual
         return least, largest, passed, uneven
+
+    def coordinates(self, transitions: Transitions) -> list[int | None]:
+        """Return the state that is the integral of each rate; None if no state is."""
+        x, changes = transitions.x, transitions.x_next - transitions.x
+        found = list[int | None]()
+        for rate in self.rates.tolist():
+            mean = x[:, rate] + 0.5 * changes[:, rate]
+            products = (changes * mean[:, None]).sum(axis=0)
+            like = np.abs(products) / np.maximum(np.linalg.norm(changes, axis=0) * np.linalg.norm(mean), 1e-300)
+            like[self.rates] = 0.0
+            found.append(int(like.argmax()) if like.max() > self.settings.integral else None)
+        return found
 
     def acting(self, transitions: Transitions) -> tuple[Transitions, Mask]:
         """Return transitions with the inputs that act, and of which the friction is known ``(N,)``: all joints move."""

@@ -24,7 +24,7 @@ from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 from ctxval.gp.cholesky import factorise, pivoted_rows
 from ctxval.learning.draws import DisturbedDynamics, DynamicsDraws, bounded
-from ctxval.learning.dry_friction import DryFriction
+from ctxval.learning.dry_friction import DryFriction, Pushes
 from ctxval.learning.hyperparameters import (
     FAMILIES,
     SMOOTHER_FAMILIES,
@@ -200,12 +200,21 @@ class DynamicsPosterior(ShortRepr):
     @functools.cached_property
     def resting(self) -> tuple[Array, Array, Array, Array] | None:
         """The numbers of :meth:`DryFriction.resting`; None without dry friction."""
-        model, steps = self.covariances.model, self.data.executions
-        if not isinstance(model, DryFriction):
-            return None
+        model, pushes = self.covariances.model, self.pushes
+        return model.resting(self.data.executions, pushes) if isinstance(model, DryFriction) and pushes else None
+
+    @functools.cached_property
+    def pushes(self) -> Pushes | None:
+        """What acted on joints in the executions; None without dry friction."""
+        return self.pushes_in(self.data.executions) if isinstance(self.covariances.model, DryFriction) else None
+
+    def pushes_in(self, steps: Transitions, errors: Array | None = None) -> Pushes:
+        """Return what acts on joints in steps of the system or of the mean; see :meth:`DryFriction.pushes`."""
+        model = self.covariances.model
+        assert isinstance(model, DryFriction)
         mean = DynamicsDraws(model, self.data, (self.most_probable.mean,), limit=self.limit[self.data.learned])
         with single_threaded(), np.errstate(all="ignore"):
-            return model.resting(steps, lambda acting: mean.residuals(steps.x[None], acting[None])[0])
+            return model.pushes(steps, lambda acting: mean.residuals(steps.x[None], acting[None])[0], errors)
 
     def model_with(self, shares: Array) -> Model:
         """Return the model of draws ``(S,)`` whose friction at rest is a share of the way to the largest one."""

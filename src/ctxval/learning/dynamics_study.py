@@ -30,6 +30,7 @@ from ctxval.learning.precision import AgreeingDynamics, AgreementSettings, agree
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, schedule, scheduled
 from ctxval.learning.regular import RegularSettings, split_transitions
+from ctxval.learning.stage_costs import Costs, Ledger, ThinkingSettings, reduced
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
@@ -42,6 +43,7 @@ class LearningSettings:
 
     small_error: float = 0.1  # left-out error below which no further part is looked for
     clear_factor: float = 3.0  # by which errors must fall without M's data, or with a task parameter, to be small
+    actuator_error: float = 0.02  # left-out error below which nobody asks whether inputs act late
     actuator_from: int = 3  # executions from which on delays, and wrong data that M was made from, are looked for
     friction_from: int = 4  # executions from which on dry friction is looked for
     parameter_from: int = 6  # executions from which on a task parameter is suspected of changing the dynamics
@@ -49,6 +51,7 @@ class LearningSettings:
     kept_share: float = 2.0  # the same, of friction that was found before: single steps tell less of it than loops do
     noise_share: float = 0.75  # largest share of the squares of these errors that counts as noise
     slow_loop: float = 0.02  # seconds of a closed loop on M from which on loops are distributed over the cores
+    thinking: ThinkingSettings = field(default_factory=ThinkingSettings)
     friction: FrictionSettings = field(default_factory=FrictionSettings)
     actuators: ActuatorSettings = field(default_factory=ActuatorSettings)
     regular: RegularSettings = field(default_factory=RegularSettings)
@@ -92,6 +95,7 @@ class DynamicsStudy(ShortRepr):
         self._actuators: dict[bytes, Actuator | None] = {}
         self._actuated: DynamicsStudy | None = None
         self._slowed: dict[bytes, DynamicsStudy | None] = {}
+        self._searches: dict[float, WorstCaseSearch] = {}
         #: largest distances of tasks if M errs by so much in each step, of each error and task
         self.under_errors: dict[bytes, dict[bytes, float]] = {}
 
@@ -120,6 +124,28 @@ class DynamicsStudy(ShortRepr):
         settings = WorstCaseSettings.for_dimension(self.validation.space.dimension, self.planner.batched)
         return WorstCaseSearch(self.planner, self.seed, settings)
 
+    def search_within(self, ledger: Ledger, replicates: int) -> WorstCaseSearch:
+        """Return the search, of fewer tasks if the budget of a ledger does not allow all of them."""
+        if not ledger.is_limited:
+            return self.search
+        shares = self.settings.thinking.shares if self.search.members is None else (1.0,)
+        for share in shares:
+            settings = reduced(self.search.settings, share) if share < 1 else self.search.settings
+
+            def seconds(costs: Costs, settings: WorstCaseSettings = settings, whole: bool = share == 1) -> float:
+                return costs.search(settings, replicates, whole=whole)
+
+            if share == shares[-1] or ledger.fits("loops", seconds, ledger.reserve):
+                break
+        if share == 1:
+            return self.search
+        if share == shares[-1]:
+            ledger.charge("loops", seconds)
+        ledger.replaced.append(f"a search of {settings.pool} tasks in place of {self.search.settings.pool}")
+        if share not in self._searches:
+            self._searches[share] = WorstCaseSearch(self.planner, self.seed, settings)
+        return self._searches[share]
+
     @functools.cached_property
     def unseen_parameters(self) -> tuple[int, ...]:
         """The indices of the task parameters that hardly change the closed loops of M."""
@@ -133,40 +159,57 @@ class DynamicsStudy(ShortRepr):
         return seen if len(seen) else every
 
     def learn(
-        self, executed: Executed, logged: Sequence[Trajectory] = (), allowed: float = 0.0
+        self,
+        executed: Executed,
+        logged: Sequence[Trajectory] = (),
+        allowed: float = 0.0,
+        ledger: Ledger | None = None,
     ) -> LearnedDynamics | None:
         """Return what executions, and recordings that belong to no task, teach; None if it is nothing.
 
-        Errors of M are not learned if they are rounding, or if no distance under them exceeds an ``allowed`` one.
+        Errors of M are not learned if they are rounding, or if no distance under them exceeds an ``allowed`` one. What
+        does not fit into the budget of a ledger is left out.
         """
+        ledger = Ledger() if ledger is None else ledger
         extended, logged = self.extended.executions(executed), () if self.extended.needs_tasks else logged
         if extended is None:
             return None
         agreeing = self._agreeing(extended, logged, executed, allowed)
         if agreeing is not None:
-            return agreeing
-        learned, settings = self._learn(extended, logged, with_data=True), self.settings
+            return replace(agreeing, ledger=ledger)
+        learned, settings = self._learn(extended, logged, with_data=True, ledger=ledger), self.settings
+        ledger.charge("learning", lambda costs: costs.learning())
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
             if learned is None or len(executed) < settings.actuator_from:
                 return learned
-            actuator = None if logged or self.friction else self._found_actuator(executed, learned)
+            asks = not logged and self.friction is None
+            if asks and self.actuator is None and learned.left_out_error > settings.actuator_error:
+                asks = ledger.learns("learning", "inputs that act late", lambda costs: costs.actuators())
+            actuator = self._found_actuator(executed, learned) if asks else None
             if actuator is not None:
                 if self._actuated is None or self._actuated.actuator != actuator:
                     acting = ExtendedValidation(self.given, actuator, executed[0][1].inputs.shape[-1])
                     self._actuated = self._with(self.given, acting)
-                return self._actuated.learn(executed) or learned
-            held = None if logged else self._with_friction(executed, learned)
+                return self._actuated.learn(executed, ledger=ledger) or learned
+            asks = not logged
+            if asks and self.friction is None and learned.left_out_error > settings.small_error:
+                asks = ledger.learns("learning", "dry friction", lambda costs: costs.friction())
+            held = self._with_friction(executed, learned, ledger) if asks else None
             if held is not None:
                 return held
             if not learned.left_out_error > settings.small_error:
                 return learned
-            if (learned.posterior.data.sources == -1).any():
-                without = self._learn(extended, logged, with_data=False)
+            has_data = bool((learned.posterior.data.sources == -1).any())
+            if has_data and ledger.learns("learning", "the data of M", lambda costs: costs.learning()):
+                without = self._learn(extended, logged, with_data=False, ledger=ledger)
                 clear = min(settings.small_error, learned.left_out_error / settings.clear_factor)
                 if without is not None and without.left_out_error < clear:
                     learned = without
             large = learned.left_out_error > settings.small_error
-            if not logged and len(executed) >= settings.parameter_from and large:
+            asks = not logged and len(executed) >= settings.parameter_from and large
+            names = len(self.given.space.units) + 1
+            stage = "parameters that change the dynamics"
+            if asks and ledger.learns("learning", stage, lambda costs: names * costs.learning()):
                 # A task parameter that explains the errors of predictions; asked in each doubling of the executions.
                 some = settings.parameter_from
                 while 2 * some <= len(executed):
@@ -178,7 +221,9 @@ class DynamicsStudy(ShortRepr):
                     clear = min(settings.small_error, without_it / settings.clear_factor)
                     self._found[key] = name if with_it < clear else None
                 parameter = self._found[key]
-                learned = learned if parameter is None else self._with_parameter(parameter).learn(executed)
+                learned = (
+                    learned if parameter is None else self._with_parameter(parameter).learn(executed, ledger=ledger)
+                )
         return learned
 
     def regular(self, executed: Executed) -> LearnedDynamics | None:
@@ -212,7 +257,9 @@ class DynamicsStudy(ShortRepr):
             return agreeing
         return agreeing if allowed and agreeing.negligible <= allowed else None
 
-    def _learn(self, executed: Executed, logged: Sequence[Trajectory], *, with_data: bool) -> LearnedDynamics | None:
+    def _learn(
+        self, executed: Executed, logged: Sequence[Trajectory], *, with_data: bool, ledger: Ledger | None = None
+    ) -> LearnedDynamics | None:
         recorded = self._recorded(executed, logged, with_data)
         if recorded is None:
             return None
@@ -228,7 +275,7 @@ class DynamicsStudy(ShortRepr):
                 self._covariances[key] = learn_covariances(model, *some, seed, settings)
             covariances = self._covariances[key]
             if covariances is not None:
-                return self._conditioned(covariances, recorded, executed, with_data)
+                return self._conditioned(covariances, recorded, executed, with_data, ledger)
         return None
 
     def as_if_executed(
@@ -242,7 +289,8 @@ class DynamicsStudy(ShortRepr):
         if isinstance(learned, AgreeingDynamics):
             return self._agreeing(together, logged, executed, learned.allowed)
         recorded = self._recorded(together, logged, learned.with_data)
-        return self._conditioned(learned.posterior.covariances, recorded, together, learned.with_data)
+        covariances, ledger = learned.posterior.covariances, learned.ledger
+        return self._conditioned(covariances, recorded, together, learned.with_data, ledger)
 
     def _conditioned(
         self,
@@ -250,6 +298,7 @@ class DynamicsStudy(ShortRepr):
         recorded: tuple[Transitions, Rows] | None,
         executed: Executed,
         with_data: bool,
+        ledger: Ledger | None = None,
     ) -> LearnedDynamics | None:
         if recorded is None:
             return None
@@ -259,8 +308,8 @@ class DynamicsStudy(ShortRepr):
         points = np.array([point for point, _ in executed]).reshape(-1, self.validation.space.dimension)
         loops = [trajectory for _, trajectory in executed]
         return LearnedDynamics(
-            self, posterior, points, loops, with_data,
-            learn_noisy=lambda: self.noise.learn(posterior, self.extended.records(executed)),
+            self, posterior, points, loops, with_data, ledger=Ledger() if ledger is None else ledger,
+            learn_noisy=lambda ledger: self.noise.learn(posterior, self.extended.records(executed), ledger),
         )  # fmt: skip
 
     @functools.cached_property
@@ -283,7 +332,7 @@ class DynamicsStudy(ShortRepr):
             return None
         records = self.extended.records
         again = noisy and self.noise.again(noisy, records(executed), others.posterior, records(kept))
-        return None if noisy and again is None else replace(others, learn_noisy=lambda: again)
+        return None if noisy and again is None else replace(others, learn_noisy=lambda ledger: again)
 
     def with_states(self, executed: Executed, point: Array, trajectory: Trajectory) -> Trajectory | None:
         """Return a later execution of a task ``(d,)`` with the states that are learned; None without estimates."""
@@ -322,8 +371,7 @@ class DynamicsStudy(ShortRepr):
                 known: LearnedDynamics | None = learned
                 if actuator is None and len(some) < len(executed):
                     known = self._learned_alone(some, with_data=True)
-                # Left-out error below which nobody asks whether inputs act late.
-                if actuator is not None or (known is not None and known.left_out_error > 0.02):
+                if actuator is not None or (known is not None and known.left_out_error > self.settings.actuator_error):
                     self._actuators[key] = self._search_actuator(some, actuator)
             actuator = self._actuators[key]
         return actuator
@@ -352,7 +400,7 @@ class DynamicsStudy(ShortRepr):
         with single_threaded(), np.errstate(all="ignore"):
             return found_actuator(model, records_of, before, 30 if estimated else 80, self.settings.actuators)
 
-    def _with_friction(self, executed: Executed, learned: LearnedDynamics) -> LearnedDynamics | None:
+    def _with_friction(self, executed: Executed, learned: LearnedDynamics, ledger: Ledger) -> LearnedDynamics | None:
         """Return what executions teach beside the dry friction that scheduled ones show; None if they show none.
 
         Without friction, predictions of left-out executions must have erred once, and at least twice as much in rates.
@@ -371,7 +419,7 @@ class DynamicsStudy(ShortRepr):
                     if tried and (study is not None or _error_of_rates(tried.learn(some), without) < share):
                         self._slowed[key] = tried
             study = self._slowed[key]
-        held = None if study is None else study.learn(executed)
+        held = None if study is None else study.learn(executed, ledger=ledger)
         return held if _error_of_rates(held, learned) < settings.kept_share else None
 
     def _friction_study(self, executed: Executed) -> DynamicsStudy | None:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import parted
-from ctxval.core.coverage import StateInputCoverage, UnsampledParameter, UnvisitedRegion
+from ctxval.core.coverage import StateInputCoverage, UnsampledParameter, UntestedRest, UnvisitedRegion
 from ctxval.core.labels import labels_of
 from ctxval.core.learned_numbers import PushedDistances
 from ctxval.core.model import Model, predicted_steps, with_memory
@@ -32,8 +32,10 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.regular import Boundary, RegularTransitions
+from ctxval.learning.rest_places import RestPlaces, rest_places, untested_rest
+from ctxval.learning.stage_costs import Costs, Ledger
 from ctxval.learning.tolerance import push_response
-from ctxval.learning.worst_case import WorstCase
+from ctxval.learning.worst_case import WorstCase, WorstCaseSearch
 
 if TYPE_CHECKING:
     from ctxval.learning.dynamics_study import DynamicsStudy
@@ -54,10 +56,38 @@ class LearnedDynamics(ShortRepr):
     split: RegularTransitions | None = None
     boundary: Boundary | None = None
     # learns the dynamics with noise; by default, there are none
-    learn_noisy: Callable[[], NoisyPosterior | None] = field(default=lambda: None, repr=False)
+    learn_noisy: Callable[[Ledger], NoisyPosterior | None] = field(default=lambda ledger: None, repr=False)
+    ledger: Ledger = field(default_factory=Ledger, repr=False)  # of the choice that needs it; no budget by default
 
     _worst_cases: dict[int, WorstCase] = field(default_factory=dict, init=False)
     _draws: dict[tuple[int, bool], Draws] = field(default_factory=dict, init=False)
+
+    @functools.cached_property
+    def search(self) -> WorstCaseSearch:
+        """Searches the tasks, as many of them as the budget of thinking allows."""
+        return self.study.search_within(self.ledger, 1 if self.noisy is None else self.noisy.replicates)
+
+    def with_whole_search(self) -> LearnedDynamics:
+        """Return this with a search of all tasks, whatever the budget."""
+        if self.search is self.study.search:
+            return self
+        noisy = self.noisy
+        return replace(self, ledger=Ledger(), learn_noisy=lambda ledger: noisy)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether no part of the dynamics was left out for lack of time."""
+        return self.drawn_from is not None and not self.ledger.incomplete
+
+    @property
+    def unseen_parameters(self) -> tuple[int, ...]:
+        """The task parameters that hardly change the closed loops of M; none if the search is reduced."""
+        return self.study.unseen_parameters if self.search is self.study.search else ()
+
+    @property
+    def seen_parameters(self) -> Rows | slice:
+        """The other task parameters."""
+        return self.study.seen_parameters if self.search is self.study.search else slice(None)
 
     @property
     def executions(self) -> list[tuple[Array, Trajectory]]:
@@ -70,7 +100,7 @@ class LearnedDynamics(ShortRepr):
         if not len(self.executed):
             return None
         with single_threaded():
-            return self.learn_noisy()
+            return self.learn_noisy(self.ledger)
 
     @property
     def drawn_from(self) -> AnyPosterior:
@@ -85,7 +115,7 @@ class LearnedDynamics(ShortRepr):
 
     def near_pool(self, points: Array) -> Array:
         """Return the distances on the posterior mean ``(m,)`` of the tasks of the pool next to points ``(m, d)``."""
-        nearest = cdist(points, self.study.search.pool).argmin(axis=1)
+        nearest = cdist(points, self.search.pool).argmin(axis=1)
         return np.asarray(self._on_pool[0][nearest])
 
     def trajectories(self, points: Array) -> list[tuple[Array, Trajectory]]:
@@ -132,12 +162,20 @@ class LearnedDynamics(ShortRepr):
     @functools.cached_property
     def screened(self) -> WorstCase:
         """The largest distance over some tasks, for each of a few draws of the dynamics: a quick lower bound."""
-        return self.study.search.screened(self.drawn_from, self.worst_of_mean, self.executed, self._rng(5))
+        replicates = 1 if self.noisy is None else self.noisy.replicates
+        settings, rests = self.search.settings, self.posterior.resting is not None
+        stage = "posterior samples in the choice of a task"
+        if not self.ledger.fits(
+            "loops", lambda costs: costs.screening(settings, replicates, rests), self.ledger.reserve
+        ):
+            self.ledger.replaced.append(stage)
+            return self.worst_of_mean
+        return self.search.screened(self.drawn_from, self.worst_of_mean, self.executed, self._rng(5))
 
     @functools.cached_property
     def worst_of_mean(self) -> WorstCase:
         """The largest distance over some tasks on the posterior mean alone, as if it were the only draw."""
-        return self.study.search.on_mean(self.drawn_from, self._on_pool[0], self.executed, self._rng(4), globally=False)
+        return self.search.on_mean(self.drawn_from, self._on_pool[0], self.executed, self._rng(4), globally=False)
 
     def without(self, rows: Collection[int]) -> LearnedDynamics | None:
         """Return what the regular transitions of the other executions teach; None if it is nothing."""
@@ -156,7 +194,7 @@ class LearnedDynamics(ShortRepr):
         their range; 0 if tasks choose no positions. If only regular transitions are learned from, the fourth array says
         how far loops cross their boundary ``(m,)``.
         """
-        search, planner = self.study.search, self.study.planner
+        search, planner = self.search, self.study.planner
         with single_threaded():
             planned = planner.plan(points)
             functions = self.drawn_from.functions_for(draws)
@@ -184,7 +222,7 @@ class LearnedDynamics(ShortRepr):
         """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""
         functions = self.drawn_from.functions_for(draws)
         if functions not in self._worst_cases:
-            search, known, rng = self.study.search, self.executed, self._rng(1)
+            search, known, rng = self.search, self.executed, self._rng(1)
             of_mean = search.on_mean(self.drawn_from, self._on_pool[0], known, rng)
             self._worst_cases[functions] = search.maxima(self.drawn_from, of_mean, known, rng, functions)
         return self._worst_cases[functions]
@@ -192,12 +230,12 @@ class LearnedDynamics(ShortRepr):
     @functools.cached_property
     def intensified_search(self) -> tuple[Array, Array]:
         """The largest distances on the posterior mean ``(2,)`` in two deeper searches, and their points ``(2, d)``."""
-        return self.study.search.intensified_search(self.drawn_from, self._rng(3))
+        return self.search.intensified_search(self.drawn_from, self._rng(3))
 
     @functools.cached_property
     def push_response(self) -> PushedDistances:
         """The largest distances over large, executed and random tasks if something pushes the posterior mean."""
-        search = self.study.search
+        search = self.search
         tasks = [self.worst_of_mean.local_maxima[:16], self.executed, search.pool[:16]]
         return push_response(self.study.planner, self.posterior, np.concatenate(tasks), self.labels)
 
@@ -235,7 +273,7 @@ class LearnedDynamics(ShortRepr):
     @functools.cached_property
     def positions(self) -> list[list[int]]:
         """Of each position that tasks choose, the two states that are its coordinates; a suite has no other tasks."""
-        study, search = self.study, self.study.search
+        study, search = self.study, self.search
         space, goals = study.validation.space, study.given.outputs is None
         labels = self.labels[: len(self.posterior.data.sizes)]
         return position_states(space, labels, search.plans, search.pool, goals=goals) if space.members is None else []
@@ -243,7 +281,7 @@ class LearnedDynamics(ShortRepr):
     @functools.cached_property
     def unvisited_region(self) -> UnvisitedRegion | None:
         """The largest region of two states that loops enter and no execution has entered."""
-        planner, states, pool = self.study.planner, len(self.posterior.data.sizes), self.study.search.pool[:256]
+        planner, states, pool = self.study.planner, len(self.posterior.data.sizes), self.search.pool[:256]
         with single_threaded():
             planned = planner.plan(pool)
             loops = planner.run(self.posterior.mean, planned)
@@ -255,13 +293,39 @@ class LearnedDynamics(ShortRepr):
         executed, labels = self.trajectories_of_system, self.labels[:states]
         return largest_pocket(visited[finite], executed, labels, self.positions, rows[finite], pool)
 
+    @functools.cached_property
+    def _rest_places(self) -> list[RestPlaces]:
+        """Where the friction at rest of each joint is tested, and where predicted runs need it."""
+        planner, search = self.study.planner, self.search
+        if self.posterior.pushes is None:
+            return []
+        with single_threaded(), np.errstate(all="ignore"):
+            return rest_places(self.posterior, planner, search.pool, search.plans, self._pool_loops)
+
+    @functools.cached_property
+    def untested_rest(self) -> UntestedRest | None:
+        """The longest stretch of places where friction at rest was not tested; None without such friction."""
+        with single_threaded(), np.errstate(all="ignore"):
+            return untested_rest(self._rest_places, self.labels, self._rng(7))
+
+    def at_untested_rest(self, task: Array) -> Array | None:
+        """Return a task ``(d,)`` that leaves rest under the force of another one where friction at rest is untested.
+
+        It is None if the other task tests no place, or if there is none.
+        """
+        if self.untested_rest is None or self.untested_rest.size <= UntestedRest.MOST:
+            return None
+        worst = max(self._rest_places, key=lambda each: each.widest[0])
+        with single_threaded(), np.errstate(all="ignore"):
+            return worst.like(task, self._rng(8))
+
     @property
     def unsampled_parameter(self) -> UnsampledParameter | None:
         """The parameter without effect on M's loops whose gap is largest; None if there is none."""
         space, executed = self.study.validation.space, self.executed
         gaps = [
             (j, *farthest_value(executed[:, j], None if space.members is None else space.members[:, j]))
-            for j in self.study.unseen_parameters
+            for j in self.unseen_parameters
         ]
         if not gaps:
             return None
@@ -273,10 +337,10 @@ class LearnedDynamics(ShortRepr):
     @functools.cached_property
     def has_idle(self) -> bool:
         """Whether an unseen parameter changes no predicted distance either, unlike the place of an obstacle."""
-        space, some = self.study.validation.space, self.study.search.pool[:8]
+        space, some = self.study.validation.space, self.search.pool[:8]
         if space.members is not None:
             return False
-        for j in self.study.unseen_parameters:
+        for j in self.unseen_parameters:
             low, high = some.copy(), some.copy()
             low[:, j], high[:, j] = 0.0, 1.0
             below, above = self.expected(np.concatenate([low, high])).reshape(2, -1)
@@ -290,10 +354,10 @@ class LearnedDynamics(ShortRepr):
         What such a parameter changes in the system is met by no choice that follows predictions. Trying it costs no
         execution of its own. The task stays the same if another distance is predicted for the moved one.
         """
-        if not self.study.unseen_parameters:
+        if not self.unseen_parameters:
             return task
         rng, moved = np.random.default_rng([self.study.seed, len(known)]), task.copy()
-        for j in self.study.unseen_parameters:
+        for j in self.unseen_parameters:
             moved[j] = farthest_value(known[:, j], rng=rng)[1]
         before, after = self.expected(np.stack([task, moved]))
         return moved if np.isclose(after, before, rtol=0.05, atol=0) else task
@@ -306,12 +370,12 @@ class LearnedDynamics(ShortRepr):
     @functools.cached_property
     def _pool_loops(self) -> list[Loops]:
         """The closed loops of the pool's tasks on the posterior mean, without noise."""
-        return self.study.planner.run(self.drawn_from.mean.without_noise(), self.study.search.plans)
+        return self.study.planner.run(self.drawn_from.mean.without_noise(), self.search.plans)
 
     @functools.cached_property
     def _on_pool(self) -> tuple[Array, StateInputCoverage]:
         """The distances of the pool's tasks on the posterior mean, and the coverage of their closed loops."""
-        search, planner = self.study.search, self.study.planner
+        search, planner = self.search, self.study.planner
         with single_threaded():
             searched, loops = self.drawn_from.mean.searched, self._pool_loops
             noisy = loops if searched.replicates == 1 else planner.run(searched, search.plans)
@@ -319,21 +383,30 @@ class LearnedDynamics(ShortRepr):
             return distances, coverage(self.posterior, search.pool, search.plans, loops, self.labels)
 
     def predict(self, point: Array) -> ExecutionPrediction | None:
-        """Return the prediction of the execution of a task, a point ``(d,)``; None if it cannot be planned."""
-        return self.predictions(point[None])[0]
+        """Return the prediction of the execution of a task, a point ``(d,)``; None if it cannot be planned.
 
-    def predictions(self, points: Array) -> list[ExecutionPrediction | None]:
+        It has fewer draws, or is None, if the budget of thinking allows no more.
+        """
+        few, replicates = self.study.settings.thinking.few_draws, 1 if self.noisy is None else self.noisy.replicates
+        for draws, number in ((40, None), (few, few)):
+            if self.ledger.fits("loops", functools.partial(Costs.prediction, draws=draws, replicates=replicates)):
+                return self.predictions(point[None], number)[0]
+            self.ledger.replaced.append(f"{draws} posterior samples in the prediction of an execution")
+        return None
+
+    def predictions(self, points: Array, draws: int | None = None) -> list[ExecutionPrediction | None]:
         """Return the predictions of the executions of tasks ``(m, d)`` by the same draws; None for one without plan."""
         rng, planner = self._rng(2), self.study.planner
         with single_threaded():
             pairs = loop_pairs(planner, self.drawn_from, points)
             if self.noisy is None and not len(pairs):
                 return [None] * len(points)
-            draws = self.drawn_from.draw(pairs[rng.permutation(len(pairs))[:300]], rng)
-            if isinstance(draws, DynamicsDraws):  # if friction at rest made predictions vague, they could not fail
-                draws = replace(draws, model=self.posterior.model_with(np.zeros(len(draws))))
+            few = {} if draws is None else {"functions": 1, "hyperparameters": draws}
+            drawn = self.drawn_from.draw(pairs[rng.permutation(len(pairs))[:300]], rng, **few)
+            if isinstance(drawn, DynamicsDraws):  # if friction at rest made predictions vague, they could not fail
+                drawn = replace(drawn, model=self.posterior.model_with(np.zeros(len(drawn))))
             recorded = self.study.extended.recorded
-            return [predict_execution(planner, draws, point, len(self.executed), recorded) for point in points]
+            return [predict_execution(planner, drawn, point, len(self.executed), recorded) for point in points]
 
     @property
     def influential(self) -> Array | None:

@@ -19,12 +19,14 @@ from ctxval._util.latest import Latest
 from ctxval.core.model import Model
 from ctxval.errors import InputError
 from ctxval.learning.closed_loops import AnyPosterior, LoopPlanner
+from ctxval.learning.draws import Draws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.innovations import FilterFit, InnovationsFit, LaggedFit, fit_filter, fit_lagged
 from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.recorded import digest, scheduled
+from ctxval.learning.stage_costs import Costs, Ledger
 from ctxval.learning.worst_case import WorstCaseSearch
 
 
@@ -64,16 +66,30 @@ class NoiseStudy:
     ) -> None:
         self.extended, self.planner, self.search, self.seed, self.quantile = extended, planner, search, seed, quantile
         self.settings = settings
-        self._structures = Latest[bytes, ChosenStructure](8)
+        self._structures = Latest[tuple[bytes, tuple[Structure, ...]], ChosenStructure](8)
 
-    def learn(self, posterior: DynamicsPosterior, records: Sequence[Record]) -> NoisyPosterior | None:
-        """Return dynamics with noise; None if task, state and input suffice for executions, or nothing is learned."""
+    def learn(self, posterior: DynamicsPosterior, records: Sequence[Record], ledger: Ledger) -> NoisyPosterior | None:
+        """Return dynamics with noise; None if task, state and input suffice for executions, or nothing is learned.
+
+        What does not fit into the budget of the ledger is left out, the costly structures first.
+        """
+        with ledger.spending("noise"):
+            return self._learn_within(posterior, records, ledger)
+
+    def _learn_within(
+        self, posterior: DynamicsPosterior, records: Sequence[Record], ledger: Ledger
+    ) -> NoisyPosterior | None:
         settings = self.settings
         # Executions do not follow from task, state and input if noise, or what is not recorded, acts.
         is_needed = float((posterior.most_probable.noise**2).max()) > settings.noisy
+        varies = not is_needed and any(self._varies(posterior, starts) for starts in (None, _scatter_of(records)))
+        stage = "whether noise matters"
+        if varies and not ledger.learns("noise", stage, lambda costs: costs.noise_on_distances()):
+            return None
         is_needed = is_needed or self._effect(posterior) > settings.matters
         is_needed = is_needed or self._effect(posterior, _scatter_of(records)) > settings.matters
-        if not is_needed and len(records) >= 3 and any(each.lags for each in settings.structures):
+        asks = not is_needed and len(records) >= 3 and any(each.lags for each in settings.structures)
+        if asks and ledger.learns("noise", "histories", lambda costs: costs.usual_lags()):
             last = records[-1]
             with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError), np.errstate(all="ignore"):
                 mean = posterior.means_without([[len(records) - 1]])
@@ -81,16 +97,19 @@ class NoiseStudy:
                 is_needed = predicted_by_history(posterior, records, self.extended.pairs, predicted, settings)
         if not is_needed:
             return None
+        structures = self._within(ledger)
+        if not structures:
+            return None
         some = scheduled(len(records))
-        key = digest(records[:some])
+        key = digest(records[:some]), structures
         replicates, learned = settings.replicates if self.planner.batched else settings.replicates_alone, None
         if key not in self._structures:
-            learned = self._learned(posterior, records[:some], replicates)
+            learned = self._learned(posterior, records[:some], replicates, structures)
             if learned is None:
                 return None
             self._structures[key] = learned[1]
         if learned is None or some < len(records):
-            learned = self._learned(posterior, records, replicates, self._structures[key])
+            learned = self._learned(posterior, records, replicates, structures, self._structures[key])
         if learned is None:
             return None
         noisy, _ = learned
@@ -102,12 +121,32 @@ class NoiseStudy:
         is_measured = self.extended.given.outputs is None and noisy.noise > settings.noisy and bool(scatters.any())
         return noisy if is_measured or self._effect(noisy) > settings.matters else replace(noisy, replicates=1)
 
+    def _within(self, ledger: Ledger) -> tuple[Structure, ...]:
+        """Return the structures that fit into the budget: all, those without measurement noise, or that of states."""
+        structures = self.settings.structures
+        without_filters = tuple(each for each in structures if not each.ratio)
+        for stage, some in (
+            ("measurement noise", structures),
+            ("more than one lag", without_filters),
+            ("histories", without_filters[:1]),
+        ):
+            lags, filters = [each.lags for each in some if not each.ratio], sum(bool(each.ratio) for each in some)
+
+            def seconds(costs: Costs, lags: Sequence[int] = lags, filters: int = filters) -> float:
+                return costs.lags(lags) + filters * costs.filter()
+
+            if ledger.learns("noise", stage, seconds):
+                return some
+        ledger.replaced[-1] = "noise"
+        return ()
+
     def again(
         self, noisy: NoisyPosterior, records: Sequence[Record], posterior: DynamicsPosterior, others: Sequence[Record]
     ) -> NoisyPosterior | None:
         """Return dynamics with the structure that was chosen for records, learned from other records."""
-        chosen = self._structures[digest(records[: scheduled(len(records))])]
-        learned = self._learned(posterior, others, noisy.replicates, chosen)
+        structures = self.settings.structures
+        chosen = self._structures[digest(records[: scheduled(len(records))]), structures]
+        learned = self._learned(posterior, others, noisy.replicates, structures, chosen)
         return None if learned is None else learned[0]
 
     def _learned(
@@ -115,6 +154,7 @@ class NoiseStudy:
         posterior: DynamicsPosterior,
         records: Sequence[Record],
         replicates: int,
+        structures: tuple[Structure, ...],
         chosen: ChosenStructure | None = None,
     ) -> tuple[NoisyPosterior, ChosenStructure] | None:
         """Return the posterior of noisy dynamics and its structure, which may be chosen; None if recursions diverge."""
@@ -122,11 +162,24 @@ class NoiseStudy:
         try:
             with single_threaded(), np.errstate(all="ignore"):
                 model, pairs = posterior.with_most_friction, self.extended.pairs
-                fit, chosen = fit_structures(model, records, pairs, data.learned, chosen, self.settings)
+                settings = replace(self.settings, structures=structures)
+                fit, chosen = fit_structures(model, records, pairs, data.learned, chosen, settings)
         except (np.linalg.LinAlgError, InputError, ValueError):  # numbers that are not finite
             return None
         horizon, seed = max(len(record.inputs) for record in records), (self.seed, len(records))
         return NoisyPosterior(fit, data, _scatter_of(records), horizon, replicates, self.quantile, seed), chosen
+
+    def _noisy(self, posterior: AnyPosterior) -> Draws | None:
+        return posterior.with_noise(self.settings.runs, self._rounding(posterior))
+
+    def _rounding(self, posterior: AnyPosterior) -> Array:
+        return self.settings.rounding * posterior.data.scale[: len(posterior.data.sizes)]
+
+    def _varies(self, posterior: AnyPosterior, starts: Array | None) -> bool:
+        """Return whether noise, or starts with such deviations ``(n,)`` if they are given, are more than rounding."""
+        if starts is None:
+            return self._noisy(posterior) is not None
+        return bool((starts > self._rounding(posterior)).any())
 
     def _effect(self, posterior: AnyPosterior, starts: Array | None = None) -> float:
         """Return the largest standard deviation of a task's distance over noise, as a share of the largest distance.
@@ -134,10 +187,9 @@ class NoiseStudy:
         If they are given, it is that over starts with such deviations ``(n,)``. The tasks have large finite distances.
         """
         planner, settings = self.planner, self.settings
-        rounding = settings.rounding * posterior.data.scale[: len(posterior.data.sizes)]
-        noisy = posterior.with_noise(settings.runs, rounding) if starts is None else None
-        if noisy is None and (starts is None or not (starts > rounding).any()):
+        if not self._varies(posterior, starts):
             return 0.0
+        noisy = self._noisy(posterior) if starts is None else None
         silent = posterior.mean.without_noise()
         with single_threaded(), np.errstate(all="ignore"):
             tasks = self.search.pool[: settings.pool]

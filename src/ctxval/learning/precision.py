@@ -65,7 +65,7 @@ class AgreeingDynamics(LearnedDynamics):
         # The next power of 2 stays the same after most executions, so that closed loops need not be run again.
         errors = 2 ** np.ceil(np.log2(np.maximum(recorded, least)))
         count = settings.tasks if planner.batched else settings.tasks_alone
-        points = np.concatenate([self.executed, self.study.search.pool[:count]])
+        points = np.concatenate([self.executed, self.search.pool[:count]])
         known = self.study.under_errors.setdefault(errors.tobytes(), {})
         new = np.array([point for point in points if point.tobytes() not in known])
         if len(new):
@@ -79,7 +79,7 @@ class AgreeingDynamics(LearnedDynamics):
     @functools.cached_property
     def _pool_loops(self) -> list[Loops]:
         """The closed loops of M on the pool's tasks, which are planned already."""
-        nominal = [(plan.nominal.states, plan.nominal.inputs) for plan in self.study.search.plans]
+        nominal = [(plan.nominal.states, plan.nominal.inputs) for plan in self.search.plans]
         loops = [[part.reshape(1, -1, *part.shape[-2:]) for part in parts] for parts in nominal]
         return [Loops(np.zeros(states.shape[:2]), states, inputs) for states, inputs in loops]
 
@@ -113,10 +113,10 @@ class AgreeingDynamics(LearnedDynamics):
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance under negligible errors, for each of so many draws."""
         points, distances = self._under_errors
-        order = np.argsort(-distances, kind="stable")[: self.study.search.settings.local_maxima]
+        order = np.argsort(-distances, kind="stable")[: self.search.settings.local_maxima]
         maxima = np.full(self.posterior.functions_for(draws), self.negligible)
-        plans = self.study.search.plans
-        unplanned = 1 - sum(int(np.sum(plan.nominal.finite)) for plan in plans) / len(self.study.search.pool)
+        plans = self.search.plans
+        unplanned = 1 - sum(int(np.sum(plan.nominal.finite)) for plan in plans) / len(self.search.pool)
         at = np.repeat(points[order[:1]], len(maxima), axis=0)
         loops = self.study.settings.agreement.ways * len(points)
         return WorstCase(maxima, at, self.negligible, points[order], loops, 0.0, unplanned)

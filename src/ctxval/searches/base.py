@@ -51,6 +51,7 @@ class Prediction(ShortRepr):
     rough: Callable[[Array], tuple[Array, Array]] | None = None  # an approximation of ``expected`` that is cheaper
     steady: Callable[[Array], bool] | None = None  # whether a point has the value of its neighbours; None if all have
     pending: Pending | None = None  # the points that are being evaluated
+    thinking: float | None = None  # seconds that the choice may take; None if they are not stated
     candidates: Array | None = None  # the only points that may be evaluated (r, d); None if all may
 
 

@@ -16,13 +16,13 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Mask, single_threaded
-from ctxval._util.checked import NonNegativeFloat, PositiveInt
+from ctxval._util.checked import NonNegativeFloat, PositiveInt, Seconds
 from ctxval._util.progress import expect
 from ctxval._util.registry import part
 from ctxval.gp.ascent import ascend, usual_effort
@@ -40,6 +40,7 @@ class TrustRegionSettings:
     points: int = 400  # largest number of points that are predicted for one suggestion, for each dimension
     # shares of it that are predicted for a choice, from thorough to fast
     shares: tuple[float, ...] = (1.0, 0.4, 0.15)
+    smaller: tuple[float, ...] = (0.05, 0.02, 0.005)  # those that a stated number of seconds may need
     improvement: float = 1e-3  # least predicted improvement worth an execution, as a share of the largest value
     compared_from: int = 6  # number of known values from which on the prediction must be better than the surrogate
     compared_on: int = 24  # largest number of known values, the latest ones, on which the two are compared
@@ -277,6 +278,7 @@ def _log_error(expected: Array, values: Array) -> float:
 
 Thinking = Literal["balanced", "fast", "thorough"]
 
+SECONDS = "thinking_seconds"  #: key in a note: the stated seconds of a choice, from which the number of points follows
 DESIGNS = "designs"  #: key in a note: the number of points that are predicted for each choice of the campaign
 
 
@@ -285,21 +287,22 @@ class Auto(TrustRegion):
     """Trust-region search on the distance that executed trajectories predict; Bayesian optimisation without them.
 
     Args:
-        thinking: how many tasks are predicted for one suggestion; each needs the design of a controller.
+        thinking: how long a suggestion may take, as tasks that are predicted; each needs the design of a controller.
             ``"thorough"``: at most 2,000 if controllers are designed in batches and 150 if they are designed one after
             the other, and at most 400 for each task parameter. ``"fast"``: 15 % of that. ``"balanced"``: 15 %, 40 % or
             all of that, whichever is the largest number that takes no longer than one execution or 1 s. This is
             measured once, after the first execution, and stored in a note; so another campaign with the same seed may
-            make other choices. A whole number: at most so many, whatever they cost.
+            make other choices. A number: the seconds of CPU that one suggestion may take, in place of that; those of
+            the campaign (``--thinking``) come before.
         optimism, misses: see :class:`TrustRegion`.
     """
 
     def __init__(
-        self, thinking: Thinking | PositiveInt = "balanced", optimism: NonNegativeFloat = 2.0, misses: PositiveInt = 3
+        self, thinking: Thinking | Seconds = "balanced", optimism: NonNegativeFloat = 2.0, misses: PositiveInt = 3
     ) -> None:
         super().__init__(optimism, misses)
         self.thinking = thinking
-        self._fixed_now: int | None = None
+        self._fixed_now: dict[str, Any] | None = None
 
     def use_prediction(self, prediction: Prediction | None) -> None:
         self._fixed_now = None
@@ -315,31 +318,34 @@ class Auto(TrustRegion):
         """Return the next point; if the number of designs is fixed at this choice, its note contains the number."""
         point = super().propose(rng)
         if self._fixed_now is not None:
-            self._last_note = {**(self._last_note or {}), DESIGNS: self._fixed_now}
+            self._last_note = {**(self._last_note or {}), **self._fixed_now}
         return point
 
     def designs(self, prediction: Prediction) -> int:
         """Return the number of points that are predicted for the next choice."""
         most = min(prediction.budget, self.settings.points * self.dimension)
-        match self.thinking:
+        stated = prediction.thinking
+        if stated is None and not isinstance(self.thinking, str):
+            stated = float(self.thinking)
+        match self.thinking if stated is None else None:
             case "thorough":
                 return most
             case "fast":
                 return max(1, round(self.settings.shares[-1] * most))
-            case number if number != "balanced":
-                return min(int(number), most)
         # The number is fixed once an execution was timed; the note of that choice has it.
-        noted = (note.get(DESIGNS) for note in self.notes if note is not None)
+        noted = (note.get(DESIGNS) for note in self.notes if note is not None and note.get(SECONDS) == stated)
         fixed = next((number for number in noted if isinstance(number, int) and number >= 1), None)
         if fixed is not None or prediction.costs is None:
             return min(most, fixed or most)
         # As many designs as take no longer than one evaluation, or one second. An evaluation that was not timed is
         # supposed to take 10 s.
         costs = prediction.costs()
-        seconds = max(1.0, 10.0 if costs.evaluation is None else costs.evaluation)
-        numbers = [max(1, round(share * most)) for share in self.settings.shares]
+        seconds = max(1.0, 10.0 if costs.evaluation is None else costs.evaluation) if stated is None else stated
+        shares = self.settings.shares if stated is None else (*self.settings.shares, *self.settings.smaller)
+        numbers = [max(min(8, most), round(share * most)) for share in shares]
         designs = next((number for number in numbers if self.thinking_seconds(costs, number) <= seconds), numbers[-1])
-        self._fixed_now = None if costs.evaluation is None else designs
+        if costs.evaluation is not None or stated is not None:
+            self._fixed_now = {DESIGNS: designs} if stated is None else {DESIGNS: designs, SECONDS: stated}
         return designs
 
     def thinking_seconds(self, costs: Costs, designs: int) -> float:

@@ -153,7 +153,8 @@ def test_parameters_that_only_matter_together_are_said_to_be_undetermined() -> N
 
 def test_an_estimate_at_a_bound_is_noted() -> None:
     _, found = fit_parameters(cart, {"mass": (0.3, 1.0), "friction": (0, 2)}, noisy(1.2, 0.3, 0.01, 0), vectorized=True)
-    assert found[0].note == "at its upper bound"
+    assert "upper" in found[0].note
+    assert not found[1].note
 
 
 def test_the_estimate_does_not_stay_in_a_local_minimum() -> None:

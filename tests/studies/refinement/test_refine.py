@@ -103,7 +103,8 @@ def test_a_model_that_is_wrong_on_what_it_has_learned_from_ends_the_refinement()
 def test_a_model_that_is_good_enough_is_not_refined() -> None:
     true = models.Function(cart, vectorized=True)
     found = refined(model=models.Corrected(true, _no_correction()))
-    assert (len(found.rounds), found.ended) == (1, "the given model is validated") or found.answer == "undecided"
+    assert len(found.rounds) == 1
+    assert found.answer in ("validated", "undecided")
     with refuses(InputError, "model"):
         write_refined("model.npz", found)
 

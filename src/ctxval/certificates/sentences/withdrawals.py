@@ -50,6 +50,11 @@ UNEVEN = (
     "a joint at rest withstood {times:.2g} times a force that moved it elsewhere: friction at rest is not the same "
     "everywhere or at any time, and its largest value is not known; use --kind posterior or an audit"
 )
+UNTESTED_REST = (
+    "no execution left rest under a small force within {length} around {place}: if friction at rest is {times:g} times "
+    "as large there, distances of {highest:.4g} are predicted; an execution that starts there under a small force "
+    "helps (`ctxval run` executes it)"
+)
 UNSUPPORTED = (
     "{above} of {executions} executions exceed {level:.4g}, more than the learned noise explains (the likelihood "
     "ratio of this noise against a share of {share:.3g} % above it is {ratio:.2g}, and at least 1 is needed); further "

@@ -136,6 +136,7 @@ class ExperimentSettings(BaseModel, extra="forbid"):
     outputs: str | list[int] | None = None  #: the indices of M's states that are recorded, or a function of them
     explore: bool | None = None  #: as the options of ``ctxval run``, so that a store knows the command that made it
     within: float = Field(default=WITHIN, gt=0, allow_inf_nan=False, strict=True)
+    thinking: float | None = Field(default=None, gt=0)  #: seconds for one choice, verdict included
     confidence: float = Field(default=CONFIDENCE, ge=LEAST_CONFIDENCE, lt=1, strict=True)
     certificate: CertificateTable = Field(default_factory=CertificateTable)
     seed: int = Field(default=0, ge=0, strict=True)

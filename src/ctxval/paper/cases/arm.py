@@ -182,6 +182,6 @@ def aspects(seed: int = 0, model: str = "fnn", settings: Settings | None = None,
     task = validation.task(validation.space.parameters(targets))
     controller = validation.synthesizer.design(task, validation.model)
     miss = distances.GoalError(norm=2, components=END_EFFECTOR)
-    nominal = systems.Simulated(validation.model).execute(controller, task)
+    promised = systems.Simulated(validation.model).execute(controller, task)
     executed = validation.system.execute(controller, task)
-    return Aspects(targets, miss(nominal, nominal, task), miss(nominal, executed, task))
+    return Aspects(targets, miss(promised, promised, task), miss(promised, executed, task))

@@ -110,7 +110,7 @@ def table_text(out: Path, studies: Sequence[Study], results: Results, scale: Sca
     lines += ["", "## Figures"]
     for study in studies:
         lines += ["", f"![{study.title}]({out.name}/{study.name}.png)", ""]
-        lines += [f"{study.title}: [{study.name}.csv]({out.name}/{study.name}.csv)"]
+        lines += [f"[{study.name}.csv]({out.name}/{study.name}.csv)"]
     modules = ", ".join(f"`ctxval.paper.cases.{case}`" for case in dict.fromkeys(study.case for study in studies))
     lines += [
         *("", "## Free parameters", ""),

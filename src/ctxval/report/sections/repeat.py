@@ -31,7 +31,7 @@ def repeat(context: ReportContext) -> Markup:
     if command := repeating_command(context):
         same = (
             "The command makes the same choices again, into a new store, with the same versions of the libraries on "
-            "the same kind of processor. The option thinking of the search auto must then be a number, fast or "
+            "the same kind of processor. The option thinking of the search auto must then be fast or "
             "thorough: balanced measures times."
         )
         parts = [paragraph(same), code(command, "Command that repeats the campaign")]

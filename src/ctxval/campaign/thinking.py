@@ -1,0 +1,142 @@
+"""The budget of thinking of a campaign: what its trials store of it, and what follows for the next choice."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ctxval.core.trajectory import Transitions
+from ctxval.core.trial import Trial
+from ctxval.core.validation import Validation
+from ctxval.learning.stage_costs import Costs, Ledger, Sizes, Speed, Thinking, ThinkingSettings, reduced, speed_to_json
+from ctxval.learning.worst_case import WorstCaseSettings
+
+THINKING = "thinking"  #: key in the note of a trial: the speed of the machine, and what the choice of its task took
+
+
+@dataclass(frozen=True)
+class TimeShortage:
+    """The evidence of a verdict does not fit into the budget of thinking."""
+
+    needed: float  #: seconds that it needs
+    budget: float  #: seconds that it may take
+    replaced: tuple[str, ...] = ()  #: the stages of choices that were replaced by cheaper ones
+
+    code: ClassVar[str] = "no_time"  #: of an undecided verdict
+
+    def __str__(self) -> str:
+        return (
+            f"the evidence of a verdict needs about {self.needed:.2g} s of thinking, and its budget is "
+            f"{self.budget:.2g} s; give --thinking {self.suggested:g} (thinking= in Python)"
+        )
+
+    @property
+    def suggested(self) -> float:
+        """A budget that suffices, with two digits."""
+        return float(f"{1.2 * self.needed:.1e}")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the code and the seconds, ready for JSON."""
+        seconds = {"needed": float(f"{self.needed:.3g}"), "budget": self.budget, "suggested": self.suggested}
+        return {"code": self.code, **seconds, "replaced": list(self.replaced)}
+
+
+class CampaignThinking:
+    """The budgets of the choices of one campaign; there is none outside of :meth:`limited`.
+
+    Args:
+        validation: the one of which dynamics are learned.
+        manual: whether people execute the tasks.
+        settings: how budgets are shared.
+    """
+
+    def __init__(self, validation: Validation, manual: bool, settings: ThinkingSettings) -> None:
+        self._validation, self._manual, self._settings = validation, manual, settings
+        self._limited, self._decides = False, False
+        self._stated: float | None = None
+        self._speed: Speed | None = None
+
+    @contextmanager
+    def limited(self, stated: float | None) -> Iterator[None]:
+        """Limit choices meanwhile to a number of seconds; None for the default, infinity for no limit."""
+        before = self._limited, self._stated
+        self._limited, self._stated = stated is None or bool(np.isfinite(stated)), stated
+        try:
+            yield
+        finally:
+            self._limited, self._stated = before
+
+    @contextmanager
+    def deciding(self) -> Iterator[None]:
+        """Take the budget of a verdict meanwhile."""
+        before, self._decides = self._decides, True
+        try:
+            yield
+        finally:
+            self._decides = before
+
+    def after(self, trials: Sequence[Trial]) -> Thinking | None:
+        """Return the budget of the next choice after trials; None if there is none, or if no speed is known."""
+        speed = self._known(trials) if self._limited else None
+        if speed is None:
+            return None
+        notes = [(trial.note or {}).get(THINKING) for trial in trials if trial.state != "open"]
+        timed = [trial.seconds for trial in trials if trial.executed and trial.seconds is not None]
+        execution = np.inf if self._manual else statistics.median(timed) if timed else None
+        known = [note for note in notes if isinstance(note, dict)]
+        thinking = Thinking.after(known, self._stated, execution, speed, self._settings)
+        return replace(thinking, seconds=thinking.decisive) if self._decides else thinking
+
+    def _known(self, trials: Sequence[Trial]) -> Speed | None:
+        """Return the speed that a trial stores, or that was measured; None if it is not known."""
+        notes = ((trial.note or {}).get(THINKING) for trial in trials)
+        stored = (Speed.from_json(note.get("speed")) for note in notes if isinstance(note, dict))
+        return next((speed for speed in stored if speed is not None), self._speed)
+
+    def measure(self, trials: Sequence[Trial]) -> None:
+        """Measure the speed of this machine if choices are limited and no trial stores it."""
+        if self._limited and self._known(trials) is None:
+            space = self._validation.space
+            points = np.random.default_rng(0).random((16, space.dimension))
+            measured = Speed.measured(
+                self._validation, points if space.members is None else space.members[:16], self._settings
+            )
+            self._speed = None if measured is None else Speed.from_json(speed_to_json(measured))
+
+    @property
+    def search_settings(self) -> WorstCaseSettings:
+        """The sizes of a search of all tasks."""
+        space, batched = self._validation.space, bool(getattr(self._validation.synthesizer, "batched", False))
+        settings = WorstCaseSettings.for_dimension(space.dimension, batched)
+        members = None if space.members is None else len(space.members)
+        return settings if members is None else replace(settings, pool=members, evaluations=members, rounds=0)
+
+    def ledger(self, trials: Sequence[Trial], executions: int) -> Ledger:
+        """Return the ledger of the next choice, which is ``spent`` if nothing can be learned within its budget."""
+        thinking = self.after(trials)
+        if thinking is None:
+            return Ledger()
+        space, settings = self._validation.space, self.search_settings
+        smallest = settings if space.members is not None else reduced(settings, thinking.settings.shares[-1])
+        data = getattr(self._validation.model, "data", None)
+        known = min(len(data), 600) if isinstance(data, Transitions) else 0
+        sizes = Sizes.of(thinking.speed, space.dimension, executions, known)
+        ledger, few = Ledger(Costs(thinking, sizes)), thinking.settings.few_draws
+        ledger.reserve = ledger.seconds("loops", lambda costs: costs.prediction(few) + costs.next_task())
+        learning = ledger.seconds("learning", lambda costs: costs.learning())
+        loops = ledger.seconds("loops", lambda costs: costs.search(smallest, whole=False) + costs.plan(4))
+        if ledger.reserve + loops + learning > thinking.seconds:
+            ledger.spent_up = True
+            ledger.incomplete = learning + ledger.seconds("loops", lambda costs: costs.search(settings))
+            ledger.replaced.append("learned dynamics, by the distances alone")
+        return ledger
+
+    def note(self, trials: Sequence[Trial], ledger: Ledger) -> dict[str, Any] | None:
+        """Return what the next trial stores of the choice of its task; None without a budget."""
+        speed = self._known(trials) if self._limited else None
+        return None if speed is None else {"speed": speed_to_json(speed), **ledger.to_json()}

@@ -1,0 +1,121 @@
+"""Campaigns with a budget of thinking: what is replaced, what a trial stores of it, and what a verdict says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conftest import make_validation
+from ctxval import Campaign, Trial
+from ctxval.campaign.dynamics import PREDICTION
+from ctxval.campaign.thinking import THINKING, CampaignThinking
+from ctxval.errors import InputError
+from ctxval.learning.stage_costs import Ledger, Speed
+
+SPEED = Speed(1.0, 1e-4, 1e-5, 1e-4, 1e-5, True, True, 2, 1, 25)
+SLOW = replace(SPEED, design=0.1, another_design=0.1, step=0.05, another_step=0.05, together=False, batched=False)
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> list[Speed]:
+    """The speed that is measured, which a test may change; stages take as long as expected."""
+    speeds = [SPEED]
+    monkeypatch.setattr(Speed, "measured", classmethod(lambda *_: speeds[0]))
+    monkeypatch.setattr(Ledger, "_switch", lambda self: self.spent.update(self.expected))
+    return speeds
+
+
+def thoughts(campaign: Campaign) -> list[dict[str, Any]]:
+    return [(trial.note or {}).get(THINKING, {}) for trial in campaign.trials]
+
+
+def facts(trials: tuple[Trial, ...]) -> list[tuple[Any, ...]]:
+    notes = [{name: value for name, value in (t.note or {}).items() if name != THINKING} for t in trials]
+    return [(t.unit_point.tobytes(), t.origin, t.distance, str(note)) for t, note in zip(trials, notes, strict=True)]
+
+
+def test_a_budget_that_suffices_changes_nothing(measured: list[Speed]) -> None:
+    limited, free = (Campaign(make_validation(), seed=0).run(6, 0.5, thinking=each) for each in (1e4, np.inf))
+    assert facts(limited.trials) == facts(free.trials)
+    assert not any(thought.get("replaced") for thought in thoughts(limited))
+    assert not any(thoughts(free))
+    verdicts = [each.verdict(0.5, thinking=1e4).to_json() for each in (limited, free)]
+    assert verdicts[0] == verdicts[1]
+
+
+def test_without_time_for_closed_loops_distances_choose(measured: list[Speed]) -> None:
+    measured[0] = SLOW
+    campaign = Campaign(make_validation(), seed=0).run(4, 100.0, thinking=1.0)
+    assert all(PREDICTION not in (trial.note or {}) for trial in campaign.trials)
+    assert thoughts(campaign)[1]["replaced"] == ["learned dynamics, by the distances alone"]
+    verdict = campaign.verdict(100.0, thinking=1.0)
+    assert verdict.answer == "undecided"
+    assert verdict.shortage is not None
+    assert (verdict.shortage["code"], verdict.shortage["budget"]) == ("no_time", 1.0)
+    assert verdict.shortage["suggested"] > verdict.shortage["needed"] > 1.0
+    assert verdict.to_json()["thinking"] == verdict.shortage
+
+
+def test_evidence_that_does_not_fit_decides_nothing_until_there_is_time(measured: list[Speed]) -> None:
+    threshold = 5.0
+    campaign = Campaign(make_validation(), seed=0).run(16, threshold)
+    free = campaign.verdict(threshold)
+    campaign = Campaign(make_validation(), seed=0).run(16, threshold, thinking=0.5)
+    short = campaign.verdict(threshold, thinking=0.5)
+    assert free.answer == "validated"
+    assert short.answer == "undecided"
+    assert short.shortage is not None
+    executions = campaign.executions
+    # The time that it asks for suffices, and costs no execution unless tests are missing.
+    again = campaign.verdict(threshold, thinking=50 * short.shortage["suggested"])
+    assert again.shortage is None
+    assert campaign.executions == executions
+
+
+def test_a_resumed_campaign_makes_the_same_choices(measured: list[Speed], tmp_path: Path) -> None:
+    whole = Campaign(make_validation(), seed=0).run(6, 5.0, thinking=0.15)
+    store = tmp_path / "parts.sqlite"
+    for budget in (2, 4, 6):
+        measured[0] = SPEED if budget == 2 else SLOW  # another machine: the stored speed counts
+        parts = Campaign(make_validation(), seed=0, store=store).run(budget, 5.0, thinking=0.15)
+    assert any(thought.get("replaced") for thought in thoughts(whole))
+    assert facts(parts.trials) == facts(whole.trials)
+    assert thoughts(parts) == thoughts(whole)
+
+
+def test_what_only_reads_a_store_without_a_speed_is_not_limited(measured: list[Speed]) -> None:
+    campaign = Campaign(make_validation(), seed=0).run(4, 0.5, thinking=np.inf)
+    measured[0] = SLOW
+    assert campaign.verdict(0.5, thinking=1e-3).shortage is None
+
+
+def test_the_default_is_that_of_executions(measured: list[Speed]) -> None:
+    validation = make_validation()
+    thinking = CampaignThinking(validation, False, validation_settings())
+    assert thinking.after([]) is None
+    with thinking.limited(2.0):
+        assert thinking.after([]) is None  # no speed is known yet
+        thinking.measure([])
+        limit = thinking.after([])
+        assert limit is not None
+        assert (limit.seconds, limit.decisive, limit.speed) == (2.0, 2.0, SPEED)
+        with thinking.deciding():
+            assert thinking.after([]) == limit
+    with thinking.limited(np.inf):
+        assert thinking.after([]) is None
+
+
+def validation_settings():  # type: ignore[no-untyped-def]
+    from ctxval.learning.dynamics_study import LearningSettings
+
+    return LearningSettings().thinking
+
+
+@pytest.mark.parametrize("seconds", [0, -1.0, np.nan, "fast"])
+def test_other_budgets_are_refused(seconds: Any) -> None:
+    with pytest.raises(InputError, match="thinking"):
+        Campaign(make_validation(), seed=0).run(2, 0.5, thinking=seconds)
