@@ -6,6 +6,7 @@ import ast
 import functools
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -49,11 +50,11 @@ def modules() -> dict[str, Path]:
 
 
 @functools.cache
-def imports_of(path: Path) -> set[str]:
-    """Return the ctxval modules that a file imports when it is loaded or later; typing-only imports count too."""
-    known = modules()
+def imports_of(path: Path, *, loaded: bool = False) -> set[str]:
+    """Return the ctxval modules that a file imports; with ``loaded``, those that are loaded with it."""
+    known, tree = modules(), ast.parse(path.read_text())
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in tree.body if loaded else ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "ctxval":
             inside = node.module.removeprefix("ctxval").lstrip(".")
             for alias in node.names:
@@ -94,6 +95,11 @@ def test_a_folder_imports_only_from_lower_floors() -> None:
             # The public face hands out what the rooms up to the campaign have.
             own, other = room(module), room(imported) or "campaign"
             assert own == other or table[other] < table[own], f"{module} imports {imported}"
+
+
+def test_no_file_imports_itself_through_others() -> None:
+    graph = {name: imports_of(path, loaded=True) & {*MODULES} - {name} for name, path in modules().items()}
+    assert len(tuple(TopologicalSorter(graph).static_order())) >= len(graph)  # a CycleError names a circle
 
 
 @pytest.mark.parametrize("module", [name for name in MODULES if room(name) in NUMBERS_ONLY])
