@@ -50,7 +50,7 @@ def _records(group: Any, name: str) -> list[Record]:
     """Return the arguments and options of a command, but not ``--help``."""
     command = group.commands[name]
     found = (each.get_help_record(_context(group, name)) for each in command.params if each.name != "help")
-    return [(" ".join(form.split()), " ".join(text.split())) for form, text in found]
+    return [(" ".join(form.split()), " ".join(text.removesuffix("[required]").split())) for form, text in found]
 
 
 def _section(group: Any, name: str, own: list[Record]) -> str:
@@ -58,10 +58,7 @@ def _section(group: Any, name: str, own: list[Record]) -> str:
     command, described = group.commands[name], {form for form, _ in own}
     others = [form for form, _ in _records(group, name) if form.startswith("-") and form not in described]
     parts = [f"## `ctxval {name}`", *_paragraphs(group, name)]
-    parts += [
-        f"```text\n$ {command.get_usage(_context(group, name)).removeprefix('Usage: ').strip()}\n```",
-        _items(own),
-    ]
+    parts += [f"`{command.get_usage(_context(group, name)).removeprefix('Usage: ').strip()}`", _items(own)]
     parts += ["Also " + ", ".join(f"`{_name((form, ''))}`" for form in others) + "."] if others else []
     return "\n\n".join(filter(None, parts))
 

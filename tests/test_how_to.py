@@ -29,13 +29,13 @@ PAGES = [*HOW_TO, *sorted(DOCS.glob("tutorials/*.md")), *sorted(DOCS.glob("expla
 PAGES += sorted(DOCS.glob("reference/*.md"))
 NEEDS = {"gymnasium": ["gymnasium", "mujoco"], "mujoco": ["mujoco"], "fmu": ["fmpy", "pythonfmu"], "mpc": ["casadi"]}
 NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn"], "state-space": ["control"]}
-NEEDS |= {"noisy-environment": ["gymnasium", "mujoco"], "policy-and-mjcf": ["mujoco", "onnx"]}
+NEEDS |= {"policy-and-mjcf": ["mujoco", "onnx"]}
 NEEDS |= {"gymnasium-and-network": ["gymnasium", "mujoco", "sklearn"]}
 NEEDS |= {"fit": ["mujoco", "sklearn", "onnx"]}
 NEEDS |= {"clusters": ["submitit", "ray", "distributed"]}
 NEEDS |= {"operate": ["starlette", "uvicorn", "jinja2", "python_multipart"]}
 LONG = ("aspect1", "causes", "clusters", "compare-controllers", "controllers", "envelope", "fit")
-LONG += ("gymnasium-and-network", "noise", "noisy-environment", "outputs", "retrain", "safety")
+LONG += ("gymnasium-and-network", "noise", "outputs", "retrain", "safety")
 LONG += ("choose-threshold", "decide", "experiment-file", "fmu", "operate", "report", "start", "watch", "workers")
 LONG += ("policy-and-mjcf", "replay")  # replay: an example and a script of the gallery replay recordings, too
 """Pages that only `make docs` and `make thorough` run: long campaigns, several of them, or many processes."""
