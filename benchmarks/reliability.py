@@ -291,7 +291,8 @@ another form, and control characters, floods or missing JSON in the output.
 
 {attack}
 
-*Largest* is the peak memory of one process. [Findings by kind](tables/reliability-attack.csv).
+*Largest* is the peak memory of one process. Recordings in other formats, names and rigs ran twice: three findings of
+the first run were mended. [Findings by kind](tables/reliability-attack.csv).
 
 ## Other processors
 
