@@ -68,10 +68,10 @@ def test_stages_that_took_longer_before_are_expected_to_do_so_again() -> None:
 @pytest.mark.parametrize(
     ("stated", "execution", "budgets"),
     [
-        (None, None, (5.0, 60.0)),
-        (None, 2.0, (5.0, 60.0)),
-        (None, 20.0, (20.0, 240.0)),
-        (None, np.inf, (60.0, 720.0)),
+        (None, None, (20.0, 60.0)),
+        (None, 2.0, (20.0, 60.0)),
+        (None, 40.0, (40.0, 120.0)),
+        (None, np.inf, (60.0, 180.0)),
         (7.0, 20.0, (7.0, 7.0)),
     ],
 )

@@ -244,8 +244,8 @@ class Campaign:
             retries: largest number of repetitions of an execution if its worker is lost.
             retry_failures: largest number of repetitions of an execution if the system fails.
             thinking: seconds of CPU that the choice of a task may take, verdict included. Stages that do not fit are
-                replaced by cheaper ones. By default, it is the time of one execution or 5 s, whichever is longer, and
-                12 times that for the evidence of a verdict; infinity for no limit.
+                replaced by cheaper ones. By default, it is the time of one execution or 20 s, whichever is longer, and
+                3 times that for the evidence of a verdict; infinity for no limit.
             progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
 
         Raises:

@@ -32,9 +32,11 @@ class ThinkingSettings:
     The costs are those of one core of 2026 (benchmarks/bench_thinking.py); ``Speed.machine`` scales them.
     """
 
-    default: float = 5.0  # seconds for one choice, if an execution takes less
+    # Seconds for one choice, if an execution takes less. With 5 s, noisy campaigns need 3 executions more: what a stage
+    # costs is at first estimated several times too high.
+    default: float = 20.0
     manual: float = 60.0  # seconds for one choice, if people execute the tasks: an execution takes longer than that
-    decisive: float = 12.0  # multiple of these that the evidence of a verdict may take; 1 if the budget is stated
+    decisive: float = 3.0  # multiple of these that the evidence of a verdict may take; 1 if the budget is stated
     shares: tuple[float, ...] = (1.0, 0.25, 0.06)  # of the tasks of a search, the largest that fits
     few_draws: int = 8  # posterior samples that predict an execution if all of them do not fit
     slower: tuple[float, float] = (0.8, 4.0)  # bounds of the correction by the choice before
