@@ -58,8 +58,8 @@ class CampaignDynamics:
     learned or predicted; it must not end a campaign. ``failure`` is the last one in words.
 
     A stored prediction belongs to one ``experiment``, a digest of the description and of how often the distance has
-    changed. ``elsewhere`` returns recordings of the same system that belong to no trial of this campaign: they teach
-    the dynamics, and they are no executions of this model's controllers.
+    changed. ``extra_recordings`` returns recordings of the same system that belong to no trial of this campaign: they
+    teach the dynamics, and they are no executions of this model's controllers.
     """
 
     def __init__(self, validation: Validation, store: Store, seed: int, description: Mapping[str, Any]) -> None:

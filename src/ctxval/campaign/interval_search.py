@@ -25,7 +25,7 @@ from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic, WholeSuite
 from ctxval.certificates.bets import bets_against
 from ctxval.certificates.bounds import Quantities, with_units
-from ctxval.certificates.checks import Remedy, open_checks
+from ctxval.certificates.checks import Remedy, open_checks, remedies
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
 from ctxval.certificates.limits import LIMITS
@@ -257,9 +257,7 @@ class IntervalSearch:
 
     def _first_remedy(self, evidence: Evidence) -> Remedy:
         """Return what the first open check needs that an execution can close; tasks of a suite are executed once."""
-        known = len(self._known)
-        remedies = (opened.check.remedy(evidence, known) for opened in open_checks(evidence) if opened.check.remedy)
-        usable = (each for each in remedies if each.kind == "drawn" or len(each.tasks))
+        usable = (each for each in remedies(evidence, len(self._known)) if each.kind == "drawn" or len(each.tasks))
         return next((each for each in usable if self._suite is None or each.kind != "again"), Remedy())
 
     def _by_evidence(self, evidence: Evidence) -> Choice:

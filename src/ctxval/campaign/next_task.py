@@ -9,7 +9,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.campaign.dynamics import NEAR
-from ctxval.certificates.checks import in_turn, open_checks
+from ctxval.certificates.checks import in_turn, remedies
 from ctxval.certificates.evidence import Evidence
 
 
@@ -48,8 +48,7 @@ def next_task(evidence: Evidence, known: Array, new: CandidateFilter) -> Array |
     It is the first new task among the remedies of the open checks, in the order of their table. If they have none, it
     is one that tests the predictions further, or the one that is farthest from all known ones.
     """
-    remedies = [opened.check.remedy(evidence, len(known)) for opened in open_checks(evidence) if opened.check.remedy]
-    tasks = [task for remedy in remedies if remedy.kind == "new" for task in remedy.tasks]
+    tasks = [task for remedy in remedies(evidence, len(known)) if remedy.kind == "new" for task in remedy.tasks]
     # Of random tasks, the one farthest from all known tasks comes first.
     others = np.random.default_rng(len(known)).random((256, known.shape[1]))
     away = np.abs(others[:, None] - known).max(axis=2).min(axis=1, initial=1.0)

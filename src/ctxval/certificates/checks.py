@@ -27,12 +27,11 @@ from ctxval.certificates.bounds import radius_of, with_units
 from ctxval.certificates.evidence import Evidence
 from ctxval.certificates.explained import evidence_against, least_explained, support_of
 from ctxval.certificates.predictions import missing_tests
+from ctxval.certificates.sample import SAME
 from ctxval.certificates.sentences import withdrawals as sentences
 from ctxval.core.coverage import StateInputGap
 
 Stage = Literal["learning", "coverage", "tested", "tests", "explained", "search", "support", "bound"]
-
-_SAME = 1e-9  # largest difference of the coordinates of two executions of one task
 
 
 @dataclass(frozen=True)
@@ -392,7 +391,7 @@ def _least_explained(evidence: Evidence, known: int) -> Remedy:
     least = least_explained(evidence.executed)
     assert least is not None
     task = np.array(least.point)
-    times = sum(np.abs(np.array(each.point) - task).max() <= _SAME for each in evidence.executed)
+    times = sum(np.abs(np.array(each.point) - task).max() <= SAME for each in evidence.executed)
     return Remedy((task[None],), "again") if times < evidence.limits.repetitions else Remedy()
 
 
@@ -664,6 +663,11 @@ CHECKS = (
 def open_checks(evidence: Evidence) -> list[Open]:
     """Return the checks that the evidence does not pass, in the order of the table."""
     return [opened for check in CHECKS if (opened := check.opened(evidence)) is not None]
+
+
+def remedies(evidence: Evidence, known: int) -> list[Remedy]:
+    """Return what the open checks need that an execution can close, in their order, given the number of known tasks."""
+    return [opened.check.remedy(evidence, known) for opened in open_checks(evidence) if opened.check.remedy]
 
 
 def is_open(evidence: Evidence, *stages: Stage) -> bool:

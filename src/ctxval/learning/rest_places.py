@@ -40,9 +40,7 @@ class RestSettings:
     moves: tuple[float, ...] = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005)  # steps of a search for tasks, as shares of the cube
     tried: int = 48  # tasks in each of these steps
     kept: int = 8  # the best tasks, from which the next step begins
-    filled: float = (
-        0.955  # length of the stretches between tested places that tasks shall leave, as a share of the most
-    )
+    filled: float = 0.955  # stretches that tasks shall leave between tested places, as a share of the most
     apart: float = 0.05  # share of the longest stretch by which a task's place may differ from that which is aimed at
     apart_in_force: float = 0.05  # share by which its force may differ
 

@@ -398,7 +398,7 @@ class Ledger:
         seconds = self.seconds(kind, of)
         if seconds + reserve > self.left:
             return False
-        self.charge(kind, of)
+        self.add(kind, seconds)
         return True
 
     def learns(self, kind: str, stage: str, of: Callable[[Costs], float]) -> bool:
