@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,15 @@ class Simulator:
         rows = np.array([known.index(site) for site in self.sites], dtype=np.intp)
         self._coordinates = np.ix_(rows, np.array(["xyz".index(axis) for axis in axes], dtype=np.intp))
         self._idle: dict[int, list[_Batch]] = {}  # batches by their number of simulations; making one costs 10 steps
+        # Fields of the model with a value for each draw, (S, ...), and the simulator of the model itself.
+        self._drawn: Mapping[str, Array] = {}
+        self._given = self
+
+    def drawn(self, fields: Mapping[str, Array]) -> Simulator:
+        """Return simulations of S models that differ in fields ``(S, ...)``; a draw is the first axis of states."""
+        another = copy.copy(self)
+        another._idle, another._drawn = {}, fields
+        return another
 
     @property
     def states(self) -> int:
@@ -61,18 +71,24 @@ class Simulator:
 
     @contextmanager
     def _batch(self, count: int) -> Iterator[_Batch]:
-        size = 1 << (count - 1).bit_length() if count else 1
+        size = max(count, 1) if self._drawn else 1 << (count - 1).bit_length() if count else 1
         idle = self._idle.setdefault(size, [])
         try:
             batch = idle.pop()
         except IndexError:
             batch = _Batch(self.model, size, self.threads)
+            for name, values in self._drawn.items():
+                batch.batch.expand(name)[:] = np.repeat(values, size // len(values), axis=0)
+            if self._drawn:
+                batch.batch.set_const()
         batch.warning[:] = 0
         yield batch
         idle.append(batch)
 
     def start(self, x: Array, forces: Array | None = None) -> Array:
         """Return the memory ``(..., k)`` of simulations that start from the model's defaults in states ``(..., n)``."""
+        if self._drawn:
+            return self._given.start(x, forces)
         rows, nq = rows_of(x), self.model.nq
         with self._batch(1) as batch:
             batch.batch.reset(stage=batch.nothing)

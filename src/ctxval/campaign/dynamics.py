@@ -304,7 +304,7 @@ class CampaignDynamics:
     def _explained(self, learned: LearnedDynamics, trials: Sequence[Trial]) -> tuple[ExplainedExecution, ...]:
         """Return all executions beside what they teach."""
         executed, points = executed_trials(self._store, trials), learned.executed
-        noisy = learned.noisy is not None and learned.noisy.is_noisy
+        noisy = learned.predicts_distributions
         expected = [] if noisy else np.nan_to_num(learned.expected(points), nan=np.inf).tolist()
         predictions, explained = learned.predictions(points) if noisy else [None] * len(points), []
         for k, ((trial, trajectory), prediction) in enumerate(zip(executed, predictions, strict=True)):
@@ -344,6 +344,8 @@ class CampaignDynamics:
             actuator=None if actuator is None else (actuator.delay, actuator.lag),
             friction=learned.friction,
             untested_rest=learned.untested_rest,
+            parameters=learned.values,
+            scatter=learned.scatter if learned.predicts_distributions else 0.0,
             physical=learned.study.given.physical,
             without_data=not learned.with_data,
             estimated=learned.study.given.outputs is not None,

@@ -127,15 +127,16 @@ def _noise_contradicted(evidence: Evidence) -> Gap:
 # Measures: coverage
 
 
-def _gap(gap: StateInputGap | None) -> Gap | None:
-    if gap is None:
+def _gap(gap: StateInputGap | None, evidence: Evidence) -> Gap | None:
+    # Parameters of M hold beyond the records, too.
+    if gap is None or evidence.parameters:
         return None
     coordinates, place = " and ".join(gap.coordinates), with_units(gap.place)
     return Gap(gap.size, {"coordinates": coordinates, "percent": 100 * gap.size, "place": place})
 
 
 def _beyond(evidence: Evidence) -> Gap | None:
-    beyond = _gap(evidence.coverage.beyond)
+    beyond = _gap(evidence.coverage.beyond, evidence)
     if beyond is None or beyond.size > evidence.limits.diverged:
         return None
     return replace(beyond, limit=evidence.most_beyond)
@@ -150,12 +151,12 @@ def _unsampled_parameter(evidence: Evidence) -> Gap | None:
 
 def _unsampled_corner(evidence: Evidence) -> Gap | None:
     corner = evidence.unsampled_corner
-    return None if corner is None else Gap(corner.gap, {"place": with_units(corner.place)})
+    return None if corner is None or evidence.parameters else Gap(corner.gap, {"place": with_units(corner.place)})
 
 
 def _unvisited_region(evidence: Evidence) -> Gap | None:
     region = evidence.unvisited_region
-    if region is None or not region.tasks:
+    if region is None or not region.tasks or evidence.parameters:
         return None
     return Gap(region.size, {"within": radius_of(region.within), "place": with_units(region.place)})
 
@@ -239,12 +240,14 @@ def _untested_rest(evidence: Evidence) -> Gap | None:
 
 
 def _needle(evidence: Evidence) -> Gap | None:
-    return None if evidence.low_dimensional else Gap(evidence.peak_ratio, {"percent": 100 * evidence.peak_ratio})
+    # Draws with rests have no sharp peaks that all share.
+    unknown = evidence.low_dimensional or evidence.scatter > 0
+    return None if unknown else Gap(evidence.peak_ratio, {"percent": 100 * evidence.peak_ratio})
 
 
 def _jump(evidence: Evidence) -> Gap | None:
     share = evidence.jump / evidence.bound if evidence.jump else 0.0
-    return None if evidence.low_dimensional else Gap(share, {"percent": 100 * share})
+    return None if evidence.low_dimensional or evidence.scatter > 0 else Gap(share, {"percent": 100 * share})
 
 
 def _searches_differ(evidence: Evidence) -> Gap:
@@ -390,6 +393,8 @@ def _influential(evidence: Evidence, known: int) -> Remedy:
 def _least_explained(evidence: Evidence, known: int) -> Remedy:
     least = least_explained(evidence.executed)
     assert least is not None
+    if evidence.quantile is None:  # another execution of the task is the same
+        return Remedy()
     task = np.array(least.point)
     times = sum(np.abs(np.array(each.point) - task).max() <= SAME for each in evidence.executed)
     return Remedy((task[None],), "again") if times < evidence.limits.repetitions else Remedy()
@@ -513,7 +518,7 @@ CHECKS = (
         "diverged",
         "coverage",
         "diverged",
-        lambda evidence: _gap(evidence.coverage.beyond),
+        lambda evidence: _gap(evidence.coverage.beyond, evidence),
         sentences.DIVERGED,
         "Runs that leave the records by ten times their range are not predicted at all.",
         _beyond_the_records,
@@ -531,7 +536,7 @@ CHECKS = (
         "gap",
         "coverage",
         "gap",
-        lambda evidence: _gap(evidence.coverage.marginal),
+        lambda evidence: _gap(evidence.coverage.marginal, evidence),
         sentences.GAP,
         "In a gap of the records, the dynamics are a guess of the prior.",
         _beyond_the_records,
@@ -540,7 +545,7 @@ CHECKS = (
         "pair_gap",
         "coverage",
         "pair_gap",
-        lambda evidence: _gap(evidence.coverage.pair),
+        lambda evidence: _gap(evidence.coverage.pair, evidence),
         sentences.PAIR_GAP,
         "In a gap of the joint records of two coordinates, too.",
         _beyond_the_records,

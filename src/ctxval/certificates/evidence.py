@@ -66,6 +66,10 @@ class Evidence(ShortRepr):
     #: of friction at rest, by how many times a force that a joint withstood exceeds one that moved it elsewhere
     uneven: float = 1.0
     untested_rest: UntestedRest | None = None  #: where friction at rest was not tested; None without dry friction
+    #: the uncertain parameters of M: median, 5 % and 95 % quantile of each by its name; empty without any
+    parameters: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    #: of M with uncertain parameters, the deviation of a task's distance that nothing explains, as a share of the largest
+    scatter: float = 0.0
     #: the largest distance under errors of M as small as all that were recorded; 0 if such errors are learned
     negligible: float = 0.0
     replaced: tuple[str, ...] = ()  #: stages that were left out, or replaced by cheaper ones, for lack of time

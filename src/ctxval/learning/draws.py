@@ -73,7 +73,7 @@ class DrawsWithoutNoise(Draws):
             return start, run_of(needed, start)
 
         def whole(part: Array) -> Array:  # a flat batch has some rows of all tasks of these draws
-            filled = np.zeros((len(needed) * tasks, part.shape[-1]))
+            filled = np.repeat(part[:1], len(needed) * tasks, axis=0)  # others run, too, and are not looked at
             filled[here] = part
             return filled
 

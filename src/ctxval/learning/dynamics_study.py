@@ -16,6 +16,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.core.uncertain import uncertain_in
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.actuators import ActuatorSettings, found_actuator
@@ -26,6 +27,7 @@ from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import NoiseSettings, NoiseStudy
+from ctxval.learning.parametric import ParametricDynamics, ParametricSettings, learned_parameters
 from ctxval.learning.precision import AgreeingDynamics, AgreementSettings, agreeing_posterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, schedule, scheduled
@@ -57,6 +59,7 @@ class LearningSettings:
     regular: RegularSettings = field(default_factory=RegularSettings)
     noise: NoiseSettings = field(default_factory=NoiseSettings)
     agreement: AgreementSettings = field(default_factory=AgreementSettings)
+    parametric: ParametricSettings = field(default_factory=ParametricSettings)
 
 
 class DynamicsStudy(ShortRepr):
@@ -177,6 +180,9 @@ class DynamicsStudy(ShortRepr):
         agreeing = self._agreeing(extended, logged, executed, allowed)
         if agreeing is not None:
             return replace(agreeing, ledger=ledger)
+        parametric = None if logged else self._parametric(extended, ledger)
+        if parametric is not None:
+            return parametric
         learned, settings = self._learn(extended, logged, with_data=True, ledger=ledger), self.settings
         ledger.charge("learning", lambda costs: costs.learning())
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
@@ -225,6 +231,21 @@ class DynamicsStudy(ShortRepr):
                     learned if parameter is None else self._with_parameter(parameter).learn(executed, ledger=ledger)
                 )
         return learned
+
+    def _parametric(self, executed: Executed, ledger: Ledger) -> LearnedDynamics | None:
+        """Return what executions teach of the uncertain parameters of M; None if it has none, or nothing is usable."""
+        model = uncertain_in(before_refinement(self.validation.model))
+        if model is None or not executed or self.extended.needs_tasks or self.friction is not None:
+            return None
+        loops, recorded = [trajectory for _, trajectory in executed], self._recorded(executed, (), with_data=False)
+        if recorded is None:
+            return None
+        seed = self.seed, len(executed), 0
+        posterior = learned_parameters(model, loops, recorded, seed, settings=self.settings.parametric)
+        if posterior is None:
+            return None
+        points = np.array([point for point, _ in executed])
+        return ParametricDynamics(self, posterior.plain, points, loops, False, ledger=ledger, parametric=posterior)
 
     def regular(self, executed: Executed) -> LearnedDynamics | None:
         """Return what the regular transitions of executions teach; None if there are no irregular ones."""
@@ -471,7 +492,7 @@ class DynamicsStudy(ShortRepr):
         returned instead.
         """
         with single_threaded():
-            if learned is None:
+            if learned is None or isinstance(learned, ParametricDynamics):
                 return self._predict_vectors(executed)
             loops = self.extended.loops
             slow = self.extended.seconds > self.settings.slow_loop

@@ -147,8 +147,13 @@ def predict_execution(
     point: Array,
     learned_from: int,
     recorded: Callable[[Trajectory], Trajectory] = lambda trajectory: trajectory,
+    *,
+    distribution: bool = False,
 ) -> ExecutionPrediction | None:
-    """Return the prediction of the execution of a task ``(d,)`` as it is recorded; None if it cannot be planned."""
+    """Return the prediction of the execution of a task ``(d,)`` as it is recorded; None if it cannot be planned.
+
+    With ``distribution``, the draws predict how an execution is distributed, as sequences of noise do.
+    """
     planned = planner.plan(point[None])
     if not planned:
         return None
@@ -163,7 +168,7 @@ def predict_execution(
     good, values = (states[kept], distances[kept]) if kept.any() else (np.zeros_like(states), np.zeros(len(states)))
     medians, deviations = np.median(good, axis=0), good.std(axis=0)
     noise, kept_distances = None, np.where(kept, distances, np.inf)
-    if draws.replicates > 1 and kept.any():
+    if (draws.replicates > 1 or distribution) and kept.any():
         whole = loops[kept]
         roughness = np.sqrt((np.diff(whole, 2, axis=1) ** 2).mean(axis=(0, 1)))
         ranges = np.maximum(np.ptp(medians, axis=0), 1e-9)

@@ -118,13 +118,33 @@ class LearnedDynamics(ShortRepr):
         nearest = cdist(points, self.search.pool).argmin(axis=1)
         return np.asarray(self._on_pool[0][nearest])
 
+    @property
+    def mean(self) -> Draws:
+        """The posterior mean without noise, as one draw."""
+        return self.posterior.mean
+
+    @property
+    def predicts_distributions(self) -> bool:
+        """Whether executions of one task differ, so that predictions are distributions."""
+        return self.noisy is not None and self.noisy.is_noisy
+
+    @property
+    def values(self) -> dict[str, tuple[float, float, float]]:
+        """The median and the 5 % and 95 % quantiles of the uncertain parameters of M; empty without any."""
+        return {}
+
+    @property
+    def scatter(self) -> float:
+        """The deviation of a task's distance that nothing learned explains, as a share of the largest; 0 if unknown."""
+        return 0.0
+
     def trajectories(self, points: Array) -> list[tuple[Array, Trajectory]]:
         """Return tasks ``(m, d)`` with their closed loops on the posterior mean, without those that diverge."""
         planner, tasks = self.study.planner, list[tuple[Array, Trajectory]]()
         with single_threaded():
             for point in points:
                 for plan in planner.plan(point[None]):
-                    (loops,) = planner.run(self.posterior.mean, [plan])
+                    (loops,) = planner.run(self.mean, [plan])
                     executed = Trajectory(plan.nominal.times, loops.states[0, 0], loops.inputs[0, 0])
                     if executed.finite:
                         tasks.append((point, executed))
@@ -233,9 +253,14 @@ class LearnedDynamics(ShortRepr):
         return self.search.intensified_search(self.drawn_from, self._rng(3))
 
     @functools.cached_property
-    def push_response(self) -> PushedDistances:
-        """The largest distances over large, executed and random tasks if something pushes the posterior mean."""
+    def push_response(self) -> PushedDistances | None:
+        """The largest distances over large, executed and random tasks if something pushes the posterior mean.
+
+        It is None if no residual is learned, with which pushes are compared.
+        """
         search = self.search
+        if not self.posterior.data.learned.any():
+            return None
         tasks = [self.worst_of_mean.local_maxima[:16], self.executed, search.pool[:16]]
         return push_response(self.study.planner, self.posterior, np.concatenate(tasks), self.labels)
 
@@ -284,7 +309,7 @@ class LearnedDynamics(ShortRepr):
         planner, states, pool = self.study.planner, len(self.posterior.data.sizes), self.search.pool[:256]
         with single_threaded():
             planned = planner.plan(pool)
-            loops = planner.run(self.posterior.mean, planned)
+            loops = planner.run(self.mean, planned)
         visited = np.concatenate([each.states.reshape(-1, states) for each in loops])
         steps = [
             np.broadcast_to(p.rows[:, None], each.states.shape[:3]) for p, each in zip(planned, loops, strict=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,9 @@ from ctxval._util.refusals import require_extra
 from ctxval._util.registry import part
 from ctxval.core.model import paired
 from ctxval.core.trajectory import Transitions
+from ctxval.core.uncertain import UncertainParameter
 from ctxval.errors import InputError
+from ctxval.models.mujoco_parameters import MuJoCoParameter, drawn_fields, uncertain_parameters
 
 _CONVERGING = 100  # iterations of the solver after which a step hardly depends on its warm start: MuJoCo's default
 _SYSID = "params_x_hat.yaml"  #: A file that ``mujoco.sysid.save_results`` writes beside the identified models
@@ -35,8 +37,15 @@ class MuJoCo:
         dt: length of a step in seconds, a multiple of the model's timestep; the timestep by default.
         data: the transitions that the model was identified from, if they are known.
         sites, axes: sites whose positions are part of the state, as in :class:`ctxval.systems.MuJoCo`.
+        uncertain: standard deviations of parameters that are not known exactly, such as ``{"friction": "30 %",
+            "mass[trunk]": "20 %", "frictionloss": 0.5}``; executions tell more of them. Names are ``mass``,
+            ``centre_x`` (``_y``, ``_z``), ``friction``, ``damping``, ``armature``, ``frictionloss``, ``stiffness``,
+            ``gain`` and ``gravity_x`` (``_y``, ``_z``), of all elements, or of those that a name or a pattern in
+            brackets matches. A share multiplies them, a number in SI units is added.
     """
 
+    uncertain: tuple[UncertainParameter, ...] = ()
+    _parameters: tuple[MuJoCoParameter, ...] = ()
     _forces: Array | None = None  # of every step; see `changed`
 
     def __init__(
@@ -47,6 +56,7 @@ class MuJoCo:
         data: Transitions | None = None,
         sites: str | Sequence[str] = (),
         axes: str = "xy",
+        uncertain: Mapping[str, float | str] | None = None,
     ) -> None:
         _, model = compile_mjcf(mjcf if is_mjcf_text(mjcf) else identified_in(Path(mjcf)))
         timestep = float(model.opt.timestep)
@@ -56,6 +66,9 @@ class MuJoCo:
             raise InputError(f"dt must be a multiple of the model's timestep, {timestep:g} s, got {dt:g} s.")
         self.data, self.sites, self.axes = data, sites, axes
         self._simulate(model)
+        if uncertain:
+            self._parameters = uncertain_parameters(model, uncertain)
+            self.uncertain = tuple(each.prior for each in self._parameters)
 
     def _simulate(self, model: Any) -> None:
         self._simulator = self._converging = Simulator(model, self.substeps, self.sites, self.axes)
@@ -91,6 +104,15 @@ class MuJoCo:
             another._simulate(model)
         if forces is not None:
             another._forces = forces
+        return another
+
+    def drawn(self, z: Array) -> MuJoCo:
+        """Return S models with standardised uncertain parameters ``(S, K)``; a draw is the first axis of states."""
+        another, fields = copy.copy(self), drawn_fields(self.compiled, self._parameters, z)
+        another._simulator = self._simulator.drawn(fields)
+        another._converging = (
+            another._simulator if self._converging is self._simulator else self._converging.drawn(fields)
+        )
         return another
 
     def step(self, x: Array, u: Array) -> Array:
