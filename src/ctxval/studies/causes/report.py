@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.representation import ShortRepr, call, line, lines, task_text
-from ctxval.studies.causes.cause import Cause, Plant, Repaired
-from ctxval.studies.causes.evidence import Explanation
+from ctxval.learning.effects import Effect, ModelWithEffects
+from ctxval.learning.effects.fit import Explanation
+from ctxval.learning.effects.plant import Plant
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +27,9 @@ class Explained(ShortRepr):
     spreads: tuple[float, ...]  #: the range of each size if one execution is left out
 
     @property
-    def causes(self) -> tuple[Cause, ...]:
+    def causes(self) -> tuple[Effect, ...]:
         """The causes with their sizes."""
-        return self.explanation.repaired.causes
+        return self.explanation.repaired.effects
 
     @property
     def resolved(self) -> bool:
@@ -78,12 +79,12 @@ class CauseReport(ShortRepr):
     ranked: tuple[Explanation, ...] = ()  #: the most probable causes alone, the best one first
 
     @property
-    def causes(self) -> tuple[Cause, ...]:
+    def causes(self) -> tuple[Effect, ...]:
         """The causes that are named; empty if there are none."""
         return self.explained[0].causes if self.named else ()
 
     @property
-    def repaired(self) -> Repaired | None:
+    def repaired(self) -> ModelWithEffects | None:
         """M with the named causes in it; None if no cause is named."""
         return self.explained[0].explanation.repaired if self.named else None
 
@@ -148,7 +149,7 @@ class CauseReport(ShortRepr):
         if not self.named:
             return None
         made = "".join(f"    {cause.python()},\n" for cause in self.causes)
-        return f"from ctxval.studies import causes\n\nmodel = causes.Repaired(model, (\n{made}))"
+        return f"from ctxval.studies import causes\n\nmodel = causes.ModelWithEffects(model, (\n{made}))"
 
     @property
     def mjcf(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Causes as parts of a model: what acts, what is recorded, and the closed loop with them."""
+"""Effects as parts of a model: what acts, what is recorded, and the closed loop with them."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ctxval import Array, Task, controllers, models, systems
-from ctxval.studies import causes
-from ctxval.studies.causes import Cause, Joint, Repaired
-from ctxval.studies.causes.flow import Flow
+from ctxval.learning import effects
+from ctxval.learning.effects import Effect, Joint, ModelWithEffects
+from ctxval.learning.effects.flow import Flow
 
 DT = 0.05
 MODEL = models.Linear([[1.0, DT], [0.0, 1.0]], [[0.5 * DT**2], [DT]])
@@ -18,14 +18,14 @@ JOINT = Joint(rate=1, position=0, share=0.5, input=0)
 FORCE: dict[str, Any] = {"joint": JOINT, "probe": 0.1, "dt": DT}
 
 
-def loops(repaired: Repaired, system: systems.System) -> tuple[Array, Array]:
+def loops(repaired: ModelWithEffects, system: systems.System) -> tuple[Array, Array]:
     task = Task([0.4, 0.0], goal=[0.0, 0.0], horizon=40, dt=DT)
     controller = controllers.LQR([10.0, 1.0], [0.5]).design(task, MODEL)
     return repaired.execute(controller, task).states, system.execute(controller, task).states
 
 
 def test_without_causes_a_model_is_the_same() -> None:
-    nothing = Repaired(MODEL, ())
+    nothing = ModelWithEffects(MODEL, ())
     ours, theirs = loops(nothing, systems.Simulated(MODEL))
     np.testing.assert_array_equal(ours, theirs)
     assert nothing.complete
@@ -33,14 +33,14 @@ def test_without_causes_a_model_is_the_same() -> None:
 
 @pytest.mark.parametrize("steps", [0.3, 1.0, 2.6])
 def test_late_inputs_act_as_in_an_imperfect_system(steps: float) -> None:
-    repaired = Repaired(MODEL, (causes.Delay((steps,)),))
+    repaired = ModelWithEffects(MODEL, (effects.Delay((steps,)),))
     ours, theirs = loops(repaired, systems.Imperfect(MODEL, delay=steps))
     np.testing.assert_allclose(ours, theirs, atol=1e-12)
     assert not repaired.complete
 
 
 def test_a_lag_lets_the_mean_of_an_exponential_act() -> None:
-    lag = Repaired(MODEL, (causes.Lag((2.0,)),))
+    lag = ModelWithEffects(MODEL, (effects.Lag((2.0,)),))
     acting = lag.acting(np.ones((5, 1)))[:, 0]
     ends = np.arange(6)
     exact = 1 - 2.0 * (np.exp(-ends[:-1] / 2.0) - np.exp(-ends[1:] / 2.0))
@@ -49,48 +49,48 @@ def test_a_lag_lets_the_mean_of_an_exponential_act() -> None:
 
 def test_backlash_loses_its_play_when_the_input_turns_round() -> None:
     inputs = np.array([0.0, 1.0, 0.9, 0.5, -1.0])[:, None]
-    acting = Repaired(MODEL, (causes.Backlash((0.2,)),)).acting(inputs)[:, 0]
+    acting = ModelWithEffects(MODEL, (effects.Backlash((0.2,)),)).acting(inputs)[:, 0]
     np.testing.assert_allclose(acting, [0.0, 0.8, 0.8, 0.7, -0.8])
 
 
 @pytest.mark.parametrize(
-    ("cause", "acts"),
+    ("effect", "acts"),
     [
-        (causes.InputGain((0.8,), 0), [1.6, -1.0]),
-        (causes.InputGain((0.5,), None), [1.0, -0.5]),
-        (causes.InputOffset((0.1,), 1), [2.0, -0.9]),
-        (causes.Saturation((0.7,), 0), [0.7, -1.0]),
-        (causes.DeadZone((0.25,), 1), [2.0, -0.75]),
-        (causes.SwappedInputs(), [-1.0, 2.0]),
-        (causes.ReversedInput((), 1), [2.0, 1.0]),
+        (effects.InputGain((0.8,), 0), [1.6, -1.0]),
+        (effects.InputGain((0.5,), None), [1.0, -0.5]),
+        (effects.InputOffset((0.1,), 1), [2.0, -0.9]),
+        (effects.Saturation((0.7,), 0), [0.7, -1.0]),
+        (effects.DeadZone((0.25,), 1), [2.0, -0.75]),
+        (effects.SwappedInputs(), [-1.0, 2.0]),
+        (effects.ReversedInput((), 1), [2.0, 1.0]),
     ],
 )
-def test_what_acts_of_inputs(cause: Cause, acts: list[float]) -> None:
-    np.testing.assert_allclose(cause.follow(np.array([2.0, -1.0]), None)[0], acts)
+def test_what_acts_of_inputs(effect: Effect, acts: list[float]) -> None:
+    np.testing.assert_allclose(effect.follow(np.array([2.0, -1.0]), None)[0], acts)
 
 
 @pytest.mark.parametrize(
-    "cause",
+    "effect",
     [
-        causes.SensorOffset((0.3,), 1),
-        causes.SensorScale((1.2,), (0, 2)),
-        causes.SwappedJoints((), (0, 2), (1, 3)),
+        effects.SensorOffset((0.3,), 1),
+        effects.SensorScale((1.2,), (0, 2)),
+        effects.SwappedJoints((), (0, 2), (1, 3)),
     ],
 )
-def test_states_are_found_again_in_what_is_recorded(cause: Cause) -> None:
+def test_states_are_found_again_in_what_is_recorded(effect: Effect) -> None:
     x = np.random.default_rng(0).normal(size=(5, 4))
-    assert np.abs(cause.recorded(x) - x).max() > 0.1
-    np.testing.assert_allclose(cause.true(cause.recorded(x)), x, rtol=1e-12)
+    assert np.abs(effect.recorded(x) - x).max() > 0.1
+    np.testing.assert_allclose(effect.true(effect.recorded(x)), x, rtol=1e-12)
 
 
 def test_coulomb_friction_holds_at_rest_and_brakes_in_motion() -> None:
-    sticking = Repaired(MODEL, (causes.Coulomb((0.4,), **FORCE),))
+    sticking = ModelWithEffects(MODEL, (effects.Coulomb((0.4,), **FORCE),))
     x, u = np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0]]), np.array([[0.3], [0.0], [0.0]])
     np.testing.assert_allclose(sticking.step(x, u)[:, 1], [0.0, 1.0 - 0.4 * DT, -1.0 + 0.4 * DT], atol=1e-12)
 
 
 def test_load_dependent_friction_grows_with_what_the_gears_carry() -> None:
-    friction = Repaired(MODEL, (causes.LoadFriction((0.5, 0.0), **FORCE, rates=(1,)),))
+    friction = ModelWithEffects(MODEL, (effects.LoadFriction((0.5, 0.0), **FORCE, rates=(1,)),))
     moving = np.array([[0.0, 10.0], [0.0, 10.0]])
     lost = MODEL.step(moving, np.array([[1.0], [2.0]])) - friction.step(moving, np.array([[1.0], [2.0]]))
     np.testing.assert_allclose(lost[:, 1], [0.5 * DT, 1.0 * DT], rtol=1e-6)
@@ -104,7 +104,7 @@ def test_the_load_of_a_gear_is_that_of_its_own_motor() -> None:
         return x + DT * (u - np.array([3.0, 0.0])) @ inverse
 
     joint = Joint(rate=0, input=0)
-    friction = causes.LoadFriction((0.5, 0.0), joint, 0.1, DT, rates=(0, 1))
+    friction = effects.LoadFriction((0.5, 0.0), joint, 0.1, DT, rates=(0, 1))
     model = models.Function(step, vectorized=True)
     flow = Flow.of(model, np.zeros((2, 2)), np.array([[4.0, 0.0], [4.0, 9.0]]))
     loads = friction.load(flow)
@@ -114,7 +114,7 @@ def test_the_load_of_a_gear_is_that_of_its_own_motor() -> None:
 
 
 def test_noise_of_measurements_acts_through_the_controller() -> None:
-    nothing, rng = Repaired(MODEL, ()), np.random.default_rng(0)
+    nothing, rng = ModelWithEffects(MODEL, ()), np.random.default_rng(0)
     task = Task([0.4, 0.0], goal=[0.0, 0.0], horizon=40, dt=DT)
     controller = controllers.LQR([10.0, 1.0], [0.5]).design(task, MODEL)
     noise = 0.01 * rng.standard_normal((41, 3, 2))
@@ -128,21 +128,21 @@ def test_noise_of_measurements_acts_through_the_controller() -> None:
 
 
 def test_an_acceleration_moves_the_position_as_far_as_the_model_integrates() -> None:
-    pushed = Repaired(MODEL, (causes.Bias((2.0,), Joint(rate=1, position=0, share=0.5), 0.1, DT),))
+    pushed = ModelWithEffects(MODEL, (effects.Bias((2.0,), Joint(rate=1, position=0, share=0.5), 0.1, DT),))
     np.testing.assert_allclose(pushed.step(np.zeros(2), np.zeros(1)), [DT**2, 2 * DT])
 
 
 @pytest.mark.parametrize(
-    ("cause", "expected"),
+    ("effect", "expected"),
     [
-        (causes.Inertia((2.0,), (JOINT,), DT), [0.25 * DT**2, 0.5 * DT]),
-        (causes.TimeStep((1.1,)), [0.605 * DT**2, 1.1 * DT]),
+        (effects.Inertia((2.0,), (JOINT,), DT), [0.25 * DT**2, 0.5 * DT]),
+        (effects.TimeStep((1.1,)), [0.605 * DT**2, 1.1 * DT]),
     ],
 )
-def test_what_an_input_of_1_does(cause: Cause, expected: list[float]) -> None:
-    np.testing.assert_allclose(Repaired(MODEL, (cause,)).step(np.zeros(2), np.ones(1)), expected)
+def test_what_an_input_of_1_does(effect: Effect, expected: list[float]) -> None:
+    np.testing.assert_allclose(ModelWithEffects(MODEL, (effect,)).step(np.zeros(2), np.ones(1)), expected)
 
 
 def test_the_lines_of_python_make_the_same_cause() -> None:
-    for cause in (causes.Coulomb((0.4,), **FORCE), causes.Delay((1.25,)), causes.InputGain((0.5,), None)):
-        assert eval(cause.python(), {"causes": causes}) == cause
+    for effect in (effects.Coulomb((0.4,), **FORCE), effects.Delay((1.25,)), effects.InputGain((0.5,), None)):
+        assert eval(effect.python(), {"causes": effects}) == effect

@@ -1,4 +1,4 @@
-"""Causes act within a step: with a linear model, they are exact for any length of the step."""
+"""Effects act within a step: with a linear model, they are exact for any length of the step."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from ctxval import Array, models, systems
-from ctxval.studies import causes
-from ctxval.studies.causes import Joint, Repaired
-from ctxval.studies.causes.flow import Flow, logarithm
+from ctxval.learning import effects
+from ctxval.learning.effects import Joint, ModelWithEffects
+from ctxval.learning.effects.flow import Flow, logarithm
 
 STATES, INPUTS = np.array([[0.4, -0.7], [-1.0, 0.2]]), np.array([[0.5], [-0.3]])
 LENGTHS = st.floats(0.02, 1.2)  # of a step; the slowest time constant is about 1
@@ -34,23 +34,23 @@ def joint(**input: int) -> Joint:
 
 
 @pytest.mark.parametrize(
-    ("cause", "true"),
+    ("effect", "true"),
     [
-        (lambda dt: causes.Viscous((0.7,), joint(input=0), 0.1, dt), arm(friction=1.2)),
-        (lambda dt: causes.Viscous((0.7,), joint(), 0.1, dt), arm(friction=1.2)),
-        (lambda dt: causes.Inertia((1.6,), (joint(),), dt), arm(inertia=1.6)),
-        (lambda dt: causes.Gravity((1.5,), (joint(),), (1,), dt), arm(spring=3.0)),
+        (lambda dt: effects.Viscous((0.7,), joint(input=0), 0.1, dt), arm(friction=1.2)),
+        (lambda dt: effects.Viscous((0.7,), joint(), 0.1, dt), arm(friction=1.2)),
+        (lambda dt: effects.Inertia((1.6,), (joint(),), dt), arm(inertia=1.6)),
+        (lambda dt: effects.Gravity((1.5,), (joint(),), (1,), dt), arm(spring=3.0)),
     ],
 )
 @given(LENGTHS)
-def test_a_linear_model_has_the_step_of_the_changed_equation(cause: Any, true: tuple[Array, Array], dt: float) -> None:
-    repaired = Repaired(sampled(*arm(), dt), (cause(dt),))
+def test_a_linear_model_has_the_step_of_the_changed_equation(effect: Any, true: tuple[Array, Array], dt: float) -> None:
+    repaired = ModelWithEffects(sampled(*arm(), dt), (effect(dt),))
     np.testing.assert_allclose(repaired.step(STATES, INPUTS), sampled(*true, dt).step(STATES, INPUTS), atol=2e-5)
 
 
 @given(LENGTHS, st.floats(0.2, 3.5))
 def test_a_part_of_a_step_and_several_steps_are_those_of_the_flow(dt: float, steps: float) -> None:
-    repaired = Repaired(sampled(*arm(), dt), (causes.TimeStep((steps,)),))
+    repaired = ModelWithEffects(sampled(*arm(), dt), (effects.TimeStep((steps,)),))
     x = STATES
     np.testing.assert_allclose(repaired.step(x, INPUTS), sampled(*arm(), dt * steps).step(x, INPUTS), atol=2e-5)
 
@@ -59,7 +59,7 @@ def test_a_part_of_a_step_and_several_steps_are_those_of_the_flow(dt: float, ste
 def test_friction_in_a_coarse_step_is_that_of_many_small_ones(dt: float) -> None:
     """The friction acts until the joint rests, which may be within the step, and then holds it."""
     exact = sampled(*arm(spring=0.0), dt)
-    sticking = Repaired(exact, (causes.Coulomb((0.4,), joint(input=0), 0.1, dt),))
+    sticking = ModelWithEffects(exact, (effects.Coulomb((0.4,), joint(input=0), 0.1, dt),))
     small = sampled(*arm(spring=0.0), dt / 400)
     x, u = np.array([[0.0, 0.6], [0.0, 0.05], [0.0, 0.0]]), np.array([[0.0], [0.1], [0.3]])
     y = x
@@ -90,7 +90,7 @@ def test_a_smooth_model_is_interpolated_to_the_third_order(part: float) -> None:
 
     def error(dt: float) -> float:
         model = models.Function(lambda x, u: systems.rk4(pendulum, dt)(x, u), vectorized=True)
-        parts = Repaired(model, (causes.TimeStep((part,)),)).step(STATES, INPUTS)
+        parts = ModelWithEffects(model, (effects.TimeStep((part,)),)).step(STATES, INPUTS)
         return float(np.abs(parts - systems.rk4(pendulum, dt * part)(STATES, INPUTS)).max())
 
     assert error(0.2) < 1e-3

@@ -7,8 +7,8 @@ import pytest
 
 from ctxval import Array, models, systems
 from ctxval.core.model import Model
-from ctxval.studies.causes.cause import Joint, Plant, plant_of
-from ctxval.studies.causes.signals import Delay, Lag
+from ctxval.learning.effects.plant import Joint, Plant, plant_of
+from ctxval.learning.effects.transport import Delay, Lag
 
 DT = 0.02
 

@@ -1,4 +1,4 @@
-"""What residuals and closed loops show beside the noise of measurements, and the shares that causes explain."""
+"""What closed loops show beside the noise of measurements."""
 
 from __future__ import annotations
 
@@ -7,47 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctxval import Array, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, systems
+from ctxval import Array, Task, TaskSpace, Validation, controllers, distances, models, systems
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
-from ctxval.studies import causes
-from ctxval.studies.causes import Repaired
-from ctxval.studies.causes.evidence import Evidence
+from ctxval.learning import effects
+from ctxval.learning.effects import ModelWithEffects
 from ctxval.studies.causes.find import ClosedLoops, ExecutedTask
 
 DT, NOISE = 0.05, np.array([2e-3, 1e-2])
 MODEL = models.Linear([[1.0, DT], [0.0, 1.0]], [[0.5 * DT**2], [DT]])
-
-
-def runs(gain: float, noise: Array, seed: int = 0) -> list[Trajectory]:
-    """Return four recordings of a carriage whose motor has a gain, with noise of the measurements."""
-    rng, made = np.random.default_rng(seed), []
-    for _ in range(4):
-        u = np.repeat(rng.normal(size=(25, 1)), 8, axis=0)
-        x = np.zeros((len(u) + 1, 2))
-        for t, each in enumerate(u):
-            x[t + 1] = MODEL.step(x[t], gain * each)
-        made.append(Trajectory(DT * np.arange(len(x)), x + noise * rng.standard_normal(x.shape), u))
-    return made
-
-
-@pytest.mark.parametrize("noise", [[0.0, 0.0], [0.002, 0.01]])
-def test_residuals_show_the_noise_of_measurements(noise: list[float]) -> None:
-    right = Repaired(MODEL, (causes.InputGain((0.7,), 0),))
-    evidence = Evidence(MODEL, runs(0.7, np.array(noise)))
-    np.testing.assert_allclose(evidence.noise(right), noise, rtol=0.15, atol=1e-6)
-
-
-def test_noise_hides_neither_a_cause_nor_that_it_is_wrong() -> None:
-    noise = np.array([0.002, 0.01])
-    evidence = Evidence(MODEL, runs(0.7, noise))
-    right, half = (Repaired(MODEL, (causes.InputGain((gain,), 0),)) for gain in (0.7, 0.85))
-    share, uncertainty = evidence.explained(right, noise)
-    assert uncertainty < 0.1
-    assert share > 1 - 3 * uncertainty
-    share, _ = evidence.explained(half, noise)  # of the squares: 1 - 0.5**2
-    assert share == pytest.approx(0.75, abs=0.02)
-    assert evidence.explained(right, 0 * noise)[1] == 0.0
 
 
 class OneByOne:
@@ -76,15 +44,15 @@ def loops(synthesizer: Any) -> tuple[ClosedLoops, ExecutedTask]:
     )
     plan = validation.plan(np.array([1.0]))
     noise = NOISE * np.random.default_rng(5).standard_normal((61, 2))
-    executed = Repaired(MODEL, (causes.Backlash((0.3,)),)).execute(plan.controller, plan.task, noise)
+    executed = ModelWithEffects(MODEL, (effects.Backlash((0.3,)),)).execute(plan.controller, plan.task, noise)
     execution = ExecutedTask(plan, executed)
     return ClosedLoops(validation, [execution]), execution
 
 
 def test_the_right_cause_leaves_what_noise_makes() -> None:
     made, execution = loops(controllers.LQR([10.0, 1.0], [0.5]))
-    right = made.predicted(Repaired(MODEL, (causes.Backlash((0.3,)),)), execution, NOISE)
-    wrong = made.predicted(Repaired(MODEL, (causes.Backlash((1.5,)),)), execution, NOISE)
+    right = made.predicted(ModelWithEffects(MODEL, (effects.Backlash((0.3,)),)), execution, NOISE)
+    wrong = made.predicted(ModelWithEffects(MODEL, (effects.Backlash((1.5,)),)), execution, NOISE)
     assert right.by_noise.min() > 0
     assert right.deviation < right.by_noise.mean() + 3 * right.by_noise.std()
     assert wrong.deviation > wrong.by_noise.mean() + 5 * wrong.by_noise.std()
@@ -92,7 +60,7 @@ def test_the_right_cause_leaves_what_noise_makes() -> None:
 
 
 def test_controllers_without_batches_have_the_same_loops() -> None:
-    right = Repaired(MODEL, (causes.Backlash((0.3,)),))
+    right = ModelWithEffects(MODEL, (effects.Backlash((0.3,)),))
     together, alone = (
         made.predicted(right, execution, NOISE)
         for made, execution in map(loops, (controllers.LQR([10.0, 1.0], [0.5]), OneByOne()))
@@ -103,7 +71,7 @@ def test_controllers_without_batches_have_the_same_loops() -> None:
 
 def test_without_noise_a_prediction_is_one_loop() -> None:
     made, execution = loops(controllers.LQR([10.0, 1.0], [0.5]))
-    predicted = made.predicted(Repaired(MODEL, ()), execution, np.zeros(2))
+    predicted = made.predicted(ModelWithEffects(MODEL, ()), execution, np.zeros(2))
     np.testing.assert_array_equal(predicted.by_noise, [0.0])
-    failing = made.predicted(Repaired(MODEL, (causes.InputGain((-1e3,), 0),)), execution, np.zeros(2))
+    failing = made.predicted(ModelWithEffects(MODEL, (effects.InputGain((-1e3,), 0),)), execution, np.zeros(2))
     assert failing.deviation > 1e3 * predicted.deviation

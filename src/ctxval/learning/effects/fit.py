@@ -1,4 +1,4 @@
-"""How well causes explain recorded executions: residuals after one step and after several, fits, and the evidence."""
+"""How well effects explain recorded executions: residuals after one step and after several, and fits."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
-from ctxval.studies.causes.cause import Cause, CauseCandidate, Repaired
-from ctxval.studies.causes.flow import Linearisation
+from ctxval.learning.effects.effect import Effect, EffectCandidate
+from ctxval.learning.effects.flow import Linearisation
+from ctxval.learning.effects.model import ModelWithEffects
 
 
 @dataclass(frozen=True)
-class EvidenceSettings:
+class SegmentSettings:
     """Of which predictions evidence is, and how far an outlier counts."""
 
     steps: tuple[int, int] = (1, 6)  # of the predictions
@@ -38,11 +39,11 @@ class Predictions(ShortRepr):
     floors: Array  #: residuals ``(n,)`` that are too small to be evidence
 
 
-class Evidence:
+class Segments:
     """Recorded executions, and what M misses in them: residuals of sizes ``(n,)`` after one step and after several.
 
     The states ``(N + k, n)`` are of all k runs, one after the other, and inputs ``(k, H, m)`` are padded with zeros.
-    Causes that are known say how states are compared.
+    Effects that are known say how states are compared.
     """
 
     def __init__(
@@ -51,8 +52,8 @@ class Evidence:
         runs: Sequence[Trajectory],
         floors: Sequence[Array] | None = None,
         most: tuple[int, int] = (600, 120),
-        settings: EvidenceSettings = EvidenceSettings(),
-        known: tuple[Cause, ...] = (),
+        settings: SegmentSettings = SegmentSettings(),
+        known: tuple[Effect, ...] = (),
     ) -> None:
         self.settings = settings
         self.model, self.known, self.horizons = model, known, [len(run.inputs) for run in runs]
@@ -64,9 +65,9 @@ class Evidence:
         self._missed = dict[int, tuple[Array, Mask]]()  # by M after a number of steps, and which of it is evidence
         for number, length in enumerate(settings.steps):
             window = self._window(min(length, min(self.horizons)), most[number])
-            left = self.left_by(Repaired(model, ()), window)
+            left = self.left_by(ModelWithEffects(model, ()), window)
             changes = _size(self._gap(self.states[window.states + window.steps] - self.states[window.states]))
-            # Smaller residuals are no evidence.
+            # Smaller residuals are no segments.
             least = np.hypot(0.01 * _size(left), 1e-3 * changes) if floors is None else floors[number]
             self.windows.append(replace(window, floors=np.maximum(least, 1e-15)))
             self.sizes.append(np.maximum(_size(left), self.windows[-1].floors))
@@ -86,7 +87,7 @@ class Evidence:
     def pairs(self) -> tuple[Array, Array, Array]:
         """The states, inputs and residuals of M in the predictions of one step, shapes ``(N, ...)``."""
         window = self.windows[0]
-        residuals = -self.left_by(Repaired(self.model, ()), window)
+        residuals = -self.left_by(ModelWithEffects(self.model, ()), window)
         inputs = self.inputs.reshape(-1, self.inputs.shape[-1])
         return self.states[window.states], inputs[window.inputs], residuals
 
@@ -98,21 +99,21 @@ class Evidence:
         with np.errstate(all="ignore"):
             return Linearisation.of(self.model, self.states, inputs[np.minimum(np.concatenate(rows), len(inputs) - 1)])
 
-    def left_by(self, repaired: Repaired, window: Predictions, moved: Array | float = 0.0) -> Array:
+    def left_by(self, repaired: ModelWithEffects, window: Predictions, moved: Array | float = 0.0) -> Array:
         """Return predicted minus recorded states ``(N, n)``; predictions begin at recorded states that are moved."""
         acting = repaired.acting(self.inputs)
         acting = acting.reshape(-1, *acting.shape[2:])
         x = repaired.true(self.states[window.states] + moved)
-        moved_back = any(type(cause).true is not Cause.true for cause in repaired.causes)
+        moved_back = any(type(effect).true is not Effect.true for effect in repaired.effects)
         for k in range(window.steps):
             at = None if moved_back else self.linearised[window.states + k]
             x = repaired.reached(x, acting[window.inputs + k], at)
         return self._gap(repaired.recorded(x) - self.states[window.states + window.steps])
 
     def _gap(self, difference: Array) -> Array:
-        return functools.reduce(lambda difference, cause: cause.gap(difference), self.known, difference)
+        return functools.reduce(lambda difference, effect: effect.gap(difference), self.known, difference)
 
-    def noise(self, repaired: Repaired) -> Array:
+    def noise(self, repaired: ModelWithEffects) -> Array:
         """Return the standard deviations ``(n,)`` of white noise of measurements, as residuals of one step show it."""
         left = self.left_by(repaired, self._window(1, len(self.states)))
         left = self.limited(left / self.sizes[0])
@@ -127,11 +128,11 @@ class Evidence:
         variances = -products.mean(axis=0) / np.clip(slopes, 0.1, None)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)) * self.sizes[0])
 
-    def explained(self, repaired: Repaired, noise: Array) -> tuple[float, float]:
+    def explained(self, repaired: ModelWithEffects, noise: Array) -> tuple[float, float]:
         """Return which share of M's squared residuals after several steps is explained, and its deviation by noise.
 
-        The effect of a cause grows with the number of steps, and so does that of an error of its size. More steps than
-        in fits are therefore taken only if noise, with standard deviations ``(n,)``, then hides less of the effect.
+        What an effect does grows with the number of steps, and so does an error of its size. More steps than in fits
+        are therefore taken only if noise, with standard deviations ``(n,)``, then hides less of the effect.
         """
         steps, shortest = self.windows[1].steps, min(self.horizons)
         lengths = [steps, *({min(self.settings.longer * steps, shortest)} - {steps} if noise.any() else ())]
@@ -142,12 +143,12 @@ class Evidence:
         most = self.settings.largest
         return np.nan_to_num(ratios, nan=most).clip(-most, most)
 
-    def _explained(self, repaired: Repaired, noise: Array, steps: int) -> tuple[float, float]:
+    def _explained(self, repaired: ModelWithEffects, noise: Array, steps: int) -> tuple[float, float]:
         settings = self.settings
         window, rng = self._window(steps, len(self.states)), np.random.default_rng(0)
         if steps not in self._missed:
             changes = _size(self._gap(self.states[window.states + steps] - self.states[window.states]))
-            missed = _size(self.left_by(Repaired(self.model, ()), window))
+            missed = _size(self.left_by(ModelWithEffects(self.model, ()), window))
             self._missed[steps] = missed, missed > 2e-3 * np.maximum(changes, 1e-12)
         sizes, matter = self._missed[steps]
         if not matter.any():
@@ -167,7 +168,7 @@ class Evidence:
         uncertainty = float(np.sqrt((spread**2).sum() * 4 / len(errors))) / whole
         return 1.0 - max(float(left.sum()), 0.0) / whole, min(uncertainty, settings.unknown)
 
-    def measured(self, repaired: Repaired) -> tuple[float, float]:
+    def measured(self, repaired: ModelWithEffects) -> tuple[float, float]:
         """Return minus twice the log-likelihood, and the share of the squared residuals of M that is left."""
         misfit, left = 0.0, 0.0
         for window, sizes in zip(self.windows, self.sizes, strict=True):
@@ -182,60 +183,60 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class Explanation(ShortRepr):
-    """Causes with fitted sizes, and how well they explain the records."""
+    """Effects with fitted sizes, and how well they explain the records."""
 
-    candidates: tuple[CauseCandidate, ...]  #: those that were fitted, with the causes of ``repaired``
-    repaired: Repaired
+    candidates: tuple[EffectCandidate, ...]  #: those that were fitted, with the effects of ``repaired``
+    repaired: ModelWithEffects
     criterion: float  #: the Bayesian information criterion; the smaller, the better
     left: float  #: the share of the squared residuals of M that is left
 
     @property
     def sizes(self) -> list[float]:
-        """The sizes of all causes."""
-        return [size for cause in self.repaired.causes for size in cause.sizes]
+        """The sizes of all effects."""
+        return [size for effect in self.repaired.effects for size in effect.sizes]
 
 
 def explained(
-    evidence: Evidence, candidates: tuple[CauseCandidate, ...], begun: Sequence[float] | Array, *, near: bool = False
+    segments: Segments, candidates: tuple[EffectCandidate, ...], begun: Sequence[float] | Array, *, near: bool = False
 ) -> Explanation:
-    """Return causes whose sizes are fitted to records by nonlinear least squares, from sizes that are ``begun`` with.
+    """Return effects whose sizes are fitted to records by nonlinear least squares, from sizes that are ``begun`` with.
 
     The residuals of each state are first divided by those of M, and then twice by what is left of them; only once if
     the fit begins ``near`` its end, with sizes that were fitted to nearly the same records.
     """
-    fit = _Fit(evidence, candidates)
+    fit = _Fit(segments, candidates)
     theta = np.array(begun)
     if len(theta):
-        theta = theta if near else fit.most_likely_of_states(fit.best(theta, evidence.sizes, 8))
+        theta = theta if near else fit.most_likely_of_states(fit.best(theta, segments.sizes, 8))
         for _ in range(1 if near else 2):
             model = fit.repaired(theta)
             sizes = [
-                np.clip(np.hypot(_size(evidence.left_by(model, window)), window.floors), window.floors, size)
-                for window, size in zip(evidence.windows, evidence.sizes, strict=True)
+                np.clip(np.hypot(_size(segments.left_by(model, window)), window.floors), window.floors, size)
+                for window, size in zip(segments.windows, segments.sizes, strict=True)
             ]
             before, theta = theta, fit.best(theta, sizes, 6)
             if (np.abs(theta - before) < 0.01 * fit.scales).all():
                 break
     model = fit.repaired(theta)
-    misfit, left = evidence.measured(model)
-    fitted = tuple(replace(each, cause=cause) for each, cause in zip(candidates, model.causes, strict=True))
+    misfit, left = segments.measured(model)
+    fitted = tuple(replace(each, effect=effect) for each, effect in zip(candidates, model.effects, strict=True))
     return Explanation(fitted, model, misfit + fit.penalty, left)
 
 
-def screened(evidence: Evidence, candidates: tuple[CauseCandidate, ...]) -> tuple[float, Array]:
-    """Return how badly causes explain records at most, and sizes to begin a fit with.
+def screened(segments: Segments, candidates: tuple[EffectCandidate, ...]) -> tuple[float, Array]:
+    """Return how badly effects explain records at most, and sizes to begin a fit with.
 
-    One Gauss-Newton step is made from each first guess of the last cause; residuals are taken as linear in the sizes.
+    One Gauss-Newton step is made from each first guess of the last effect; residuals are taken as linear in the sizes.
     """
-    fit = _Fit(evidence, candidates)
-    known = [size for each in candidates[:-1] for size in each.cause.sizes]
+    fit = _Fit(segments, candidates)
+    known = [size for each in candidates[:-1] for size in each.effect.sizes]
     results = []
     for start in candidates[-1].starts:
         theta = np.array([*known, *start])
-        here = fit.errors(theta, evidence.sizes)
+        here = fit.errors(theta, segments.sizes)
         linear, moved = here, theta
         if len(theta):
-            J = fit.slope(theta, evidence.sizes, here)
+            J = fit.slope(theta, segments.sizes, here)
             moved = np.clip(theta + np.linalg.lstsq(J, -here, rcond=1e-8)[0], fit.low, fit.high)
             linear = here + J @ (moved - theta)
         results.append((fit.misfit(linear) + fit.penalty, moved))
@@ -243,27 +244,27 @@ def screened(evidence: Evidence, candidates: tuple[CauseCandidate, ...]) -> tupl
 
 
 class _Fit:
-    """The residuals of records as a function of the sizes of causes."""
+    """The residuals of records as a function of the sizes of effects."""
 
-    def __init__(self, evidence: Evidence, candidates: tuple[CauseCandidate, ...]) -> None:
-        self.evidence, self.candidates = evidence, candidates
+    def __init__(self, segments: Segments, candidates: tuple[EffectCandidate, ...]) -> None:
+        self.segments, self.candidates = segments, candidates
         self.low, self.high, self.scales = (
             np.array([value for each in candidates for value in getattr(each, name)])
             for name in ("low", "high", "scales")
         )
-        # Which cause it is counts like a size.
-        self.penalty = (len(self.scales) + len(candidates)) * float(np.log(len(evidence.windows[0].states)))
+        # Which effect it is counts like a size.
+        self.penalty = (len(self.scales) + len(candidates)) * float(np.log(len(segments.windows[0].states)))
 
-    def repaired(self, theta: Array) -> Repaired:
+    def repaired(self, theta: Array) -> ModelWithEffects:
         sizes = iter(theta.tolist())
-        causes = (each.cause.with_sizes([next(sizes) for _ in each.scales]) for each in self.candidates)
-        return Repaired(self.evidence.model, tuple(causes))
+        effects = (each.effect.with_sizes([next(sizes) for _ in each.scales]) for each in self.candidates)
+        return ModelWithEffects(self.segments.model, tuple(effects))
 
     def errors(self, theta: Array, sizes: Sequence[Array]) -> Array:
         """Return residuals in given sizes, whose squares are means over the predictions of each window."""
         model, parts = self.repaired(theta), []
-        for window, size in zip(self.evidence.windows, sizes, strict=True):
-            left = self.evidence.limited(self.evidence.left_by(model, window) / size)
+        for window, size in zip(self.segments.windows, sizes, strict=True):
+            left = self.segments.limited(self.segments.left_by(model, window) / size)
             parts.append(left.ravel() / np.sqrt(len(left)))
         return np.concatenate(parts)
 
@@ -277,21 +278,21 @@ class _Fit:
 
     def most_likely_of_states(self, theta: Array) -> Array:
         """Return the most likely of these sizes and of those that explain one state alone, by a Gauss-Newton step."""
-        # Where M integrates a position otherwise than the system does, a cause explains the rate alone.
-        here, n = self.errors(theta, self.evidence.sizes), len(self.evidence.sizes[0])
-        J, tried = self.slope(theta, self.evidence.sizes, here), [theta]
+        # Where M integrates a position otherwise than the system does, an effect explains the rate alone.
+        here, n = self.errors(theta, self.segments.sizes), len(self.segments.sizes[0])
+        J, tried = self.slope(theta, self.segments.sizes, here), [theta]
         for i in range(n):  # rows of errors are predictions after predictions, each with all states
             step = np.linalg.lstsq(J[i::n], -here[i::n], rcond=1e-8)[0]
             tried.append(np.clip(theta + step, self.low, self.high))
         likely = min(tried, key=lambda each: self.misfit(here + J @ (each - theta)))
         if likely is theta:
             return theta
-        return min((theta, likely), key=lambda each: self.evidence.measured(self.repaired(each))[0])
+        return min((theta, likely), key=lambda each: self.segments.measured(self.repaired(each))[0])
 
     def misfit(self, errors: Array) -> float:
         """Return minus twice the log-likelihood of residuals in the sizes of those of M."""
         misfit, first = 0.0, 0
-        for window, size in zip(self.evidence.windows, self.evidence.sizes, strict=True):
+        for window, size in zip(self.segments.windows, self.segments.sizes, strict=True):
             count, n = len(window.states), len(size)
             squares = (errors[first : first + count * n].reshape(count, n) ** 2).sum(axis=0)
             misfit += count * float(np.log(squares + (window.floors / size) ** 2).sum())

@@ -1,0 +1,48 @@
+"""Effects that a model may lack: one dictionary for verdicts, causes and repair."""
+
+from ctxval.learning.effects.backlash import Backlash
+from ctxval.learning.effects.bias import Bias, InputOffset
+from ctxval.learning.effects.dead_zone import DeadZone
+from ctxval.learning.effects.effect import Effect
+from ctxval.learning.effects.friction import Coulomb, LoadFriction, Stribeck, Viscous
+from ctxval.learning.effects.gain import InputGain, ReversedInput, SwappedInputs
+from ctxval.learning.effects.gravity import Gravity
+from ctxval.learning.effects.inertia import Inertia
+from ctxval.learning.effects.model import ModelWithEffects
+from ctxval.learning.effects.mujoco import BodyMass, JointAttribute, MassCentre
+from ctxval.learning.effects.plant import Joint
+from ctxval.learning.effects.saturation import Saturation
+from ctxval.learning.effects.sensor import SensorOffset, SensorScale, SwappedJoints, WrappedAngle
+from ctxval.learning.effects.time_step import TimeStep
+from ctxval.learning.effects.transport import Delay, Lag, ObservationDelay
+
+__all__ = [
+    "Backlash",
+    "Bias",
+    "BodyMass",
+    "Coulomb",
+    "DeadZone",
+    "Delay",
+    "Effect",
+    "Gravity",
+    "Inertia",
+    "InputGain",
+    "InputOffset",
+    "Joint",
+    "JointAttribute",
+    "Lag",
+    "LoadFriction",
+    "MassCentre",
+    "ModelWithEffects",
+    "ObservationDelay",
+    "ReversedInput",
+    "Saturation",
+    "SensorOffset",
+    "SensorScale",
+    "Stribeck",
+    "SwappedInputs",
+    "SwappedJoints",
+    "TimeStep",
+    "Viscous",
+    "WrappedAngle",
+]

@@ -1,0 +1,37 @@
+"""Steps of the model that take another time than those of the system."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from ctxval.core.model import Model
+from ctxval.learning.effects.effect import Effect
+from ctxval.learning.effects.plant import Plant
+from ctxval.models import MuJoCo
+
+
+@dataclass(frozen=True)
+class TimeStep(Effect):
+    """A step of M takes another time than that of the system. Size: the steps of M in one step of the system."""
+
+    name: ClassVar[str] = "time step"
+
+    def duration(self, model: Model) -> float:
+        return 1.0 if isinstance(model, MuJoCo) else self.sizes[0]
+
+    def model(self, model: Model) -> Model:
+        if not isinstance(model, MuJoCo):
+            return model
+        substeps = max(1, round(self.sizes[0] * model.substeps))
+
+        def change(compiled: Any) -> None:
+            compiled.opt.timestep *= self.sizes[0] * model.substeps / substeps
+
+        changed = model.changed(change)
+        changed.substeps = substeps
+        return changed
+
+    def text(self, plant: Plant) -> str:
+        step, taken = 1e3 * plant.dt, 1e3 * plant.dt * self.sizes[0]
+        return f"one step of the system takes {taken:.4g} ms of M, and not {step:.4g} ms"
