@@ -398,8 +398,6 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "data.Recordings": recordings,
     "data.Signal": lambda: data.Signal(np.arange(9.0), np.zeros((9, 2))),
     "data.Table": lambda: data.Table("run.csv", ("t", "x"), lambda names: dict.fromkeys(names, np.arange(9.0))),
-    "studies.fitting.Excitation": lambda: fitting.Excitation(make_validation(), "chirp", 0.5, 5.0),
-    "studies.fitting.Excited": lambda: fitting.Excited(policy, np.ones((9, 1)), controllers.Limits([-1.0], [1.0])),
     "studies.fitting.FailedFit": lambda: fitting.FailedFit("linear", "too few steps"),
     "studies.fitting.FitReport": fitted,
     "studies.fitting.FittedModel": lambda: fitted().fitted[0],
