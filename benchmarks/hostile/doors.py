@@ -62,7 +62,7 @@ def outputs(rng: Rng, folder: Path, base: Path) -> Case:
         ("ask", stores.NAME, "--trial", "4", "--out", str(pick(rng, ("saved", victim)))),
         ("init", str(pick(rng, ("experiment.toml", "new.toml", "mapping.toml", "saved", victim)))),
         ("run", "experiment.toml", "--search", "random", "--budget", "2", "--no-report", "--store", victim),
-        ("compare", "one=experiment.toml", "two=pendulum", "--budget", "2", "--out", victim),
+        ("compare", "one=experiment.toml", "two=pendulum", "--budget", "2", "--stores", victim),
         ("ask", "experiment.toml", "--store", victim),
         ("refine", stores.NAME, "--threshold", "0.1", "--method", "linear", "--budget", "5", "--out", model),
         ("certify", stores.NAME, "--threshold", "0.5", "--kind", "scenario"),
