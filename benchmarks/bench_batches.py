@@ -30,11 +30,11 @@ from ctxval import (
     searches,
     systems,
 )
-from ctxval._util.json_lines import JsonLines
 from ctxval.campaign import workers
 from ctxval.campaign.goals_of_model import GoalWarning
 from ctxval.paper.cases import arm
 from ctxval.studies.fitting import Excitation
+from json_lines import JsonLines
 
 EXECUTIONS, ROUNDS, SUBSTEPS, DT = 256, 3, 5, 0.05
 LEAST = 1.5

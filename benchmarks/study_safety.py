@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from ctxval import Array, Campaign, Task, TaskSpace, Trajectory, Validation, controllers, models, systems
-from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import CertificateOptions, Dynamics
 from ctxval.cli.config.settings import read_settings
 from ctxval.distances import MaximumDeviation, UnsafeMargin
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.specs import Ball, Box, Outside, ReachAvoid
 from ctxval.studies.safety import assess, disturbance_set, draw_tasks, largest_residuals, tube_of
+from json_lines import JsonLines
 from safety_systems import SYSTEMS, WALL_D_A, WALL_D_B
 
 STORED = JsonLines(Path(__file__).parent / "results" / "safety.jsonl", ("part", "case", "seed", "asked"))

@@ -149,7 +149,6 @@ _DEFAULTS = {
     "run": ("runs/*", "runs"),
     "compare": ("runs/*", "runs"),
     "collect": ("logs/*", "logs"),
-    "reproduce": ("reproduction*",),
 }
 _NEVER_MIND = ("*__pycache__*", "f/home/*", "f/PWNED", "f/elsewhere*")
 """Files of the interpreter and of libraries; the last ones are those of hostile code that may run."""

@@ -1,4 +1,4 @@
-"""``ctxval init``, ``check``, ``cases`` and ``reproduce``: experiment files, the built-in cases and the paper."""
+"""``ctxval init``, ``check`` and ``cases``: experiment files and the built-in cases of the paper."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from rich.progress import Progress, TextColumn
-
 from ctxval._util.files import write_text
 from ctxval._util.texts import shell_word
 from ctxval._util.toml import toml_text
-from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, err, named_values, out, print_table
+from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, named_values, out, print_table
 from ctxval.cli.config.check import aspect1_findings, check_experiment
 from ctxval.cli.config.parts import part, plain_options
 from ctxval.cli.config.settings import read_settings
@@ -113,24 +111,3 @@ def cases(name: str | None = None) -> Any:
         return {each: text for each, (text, _) in listed.items()}
     text, options = listed[name]
     return {"case": name, "text": text, "options": options}
-
-
-@command(with_json=False)
-def reproduce(
-    name: str, quick: bool = False, out_: Path = Path("reproduction"), results: Path | None = None, workers: int = 2
-) -> None:
-    from ctxval.paper import reproduce as paper  # imported here: the other commands do not need it
-
-    with Progress(TextColumn("runs"), *Progress.get_default_columns(), console=err) as progress:
-        line = progress.add_task("")
-        table = paper.reproduce(
-            name,
-            out_,
-            stored=results,
-            scale=paper.QUICK if quick else paper.FULL,
-            workers=workers,
-            on_start=lambda missing: progress.update(line, total=missing),
-            on_done=lambda job: progress.update(line, advance=1, description=job.key),
-        )
-    out.say(f"table: {table}")
-    out.say(f"figures and data: {out_}")

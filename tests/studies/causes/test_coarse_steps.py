@@ -23,8 +23,8 @@ from ctxval import (
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.core.trajectory import Trajectory
+from ctxval.learning.effects.transport import SeeingLate
 from ctxval.studies.causes import CauseReport, find_causes
-from ctxval.studies.causes.signals import SeeingLate
 from facts import assert_names
 from rig_thorough import more
 

@@ -28,6 +28,7 @@ from ctxval.campaign.storage.store import Store
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.certificates.scenario import volume_bound
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
+from ctxval.core.floating_base import UntilFall
 from ctxval.core.model import Model, linearize
 from ctxval.core.plan import Plan
 from ctxval.core.space import TaskSpace
@@ -42,12 +43,13 @@ from ctxval.specs import Specification
 
 def spec_distance(validation: Validation) -> UnsafeMargin:
     """Return the distance of a validation, which must be the margin of unsafe tasks."""
-    if not isinstance(validation.distance, UnsafeMargin):
+    distance = validation.distance.distance if isinstance(validation.distance, UntilFall) else validation.distance
+    if not isinstance(distance, UnsafeMargin):
         raise InputError(
-            f"the distance must be an UnsafeMargin of a specification, got {validation.distance!r}: see "
+            f"the distance must be an UnsafeMargin of a specification, got {distance!r}: see "
             "ctxval.studies.safety.judged_by."
         )
-    return validation.distance
+    return distance
 
 
 def on_model(planner: LoopPlanner, spec: Specification, unit: Array) -> Array:
