@@ -340,7 +340,7 @@ class CampaignDynamics:
             low_dimensional=worst.points.shape[1] <= LIMITS.low_dimensional and self.study.planner.batched,
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
-            actuator=None if actuator is None else (actuator.delay, actuator.lag),
+            actuator=None if actuator is None else (float(actuator.delay), float(actuator.lag)),
             friction=learned.friction,
             untested_rest=learned.untested_rest,
             physical=learned.study.given.physical,

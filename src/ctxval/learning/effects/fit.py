@@ -193,7 +193,7 @@ class Explanation(ShortRepr):
     @property
     def sizes(self) -> list[float]:
         """The sizes of all effects."""
-        return [size for effect in self.repaired.effects for size in effect.sizes]
+        return [float(size) for effect in self.repaired.effects for size in effect.sizes]
 
 
 def explained(
@@ -248,17 +248,17 @@ class _Fit:
 
     def __init__(self, segments: Segments, candidates: tuple[EffectCandidate, ...]) -> None:
         self.segments, self.candidates = segments, candidates
+        parameters = [parameter for each in candidates for parameter in each.parameters]
         self.low, self.high, self.scales = (
-            np.array([value for each in candidates for value in getattr(each, name)])
-            for name in ("low", "high", "scales")
+            np.array([getattr(parameter, name) for parameter in parameters]) for name in ("low", "high", "scale")
         )
         # Which effect it is counts like a size.
         self.penalty = (len(self.scales) + len(candidates)) * float(np.log(len(segments.windows[0].states)))
 
     def repaired(self, theta: Array) -> ModelWithEffects:
         sizes = iter(theta.tolist())
-        effects = (each.effect.with_sizes([next(sizes) for _ in each.scales]) for each in self.candidates)
-        return ModelWithEffects(self.segments.model, tuple(effects))
+        effects = (each.effect.with_sizes([next(sizes) for _ in each.parameters]) for each in self.candidates)
+        return ModelWithEffects(self.segments.model, tuple(effects), self.segments.inputs.shape[-1])
 
     def errors(self, theta: Array, sizes: Sequence[Array]) -> Array:
         """Return residuals in given sizes, whose squares are means over the predictions of each window."""

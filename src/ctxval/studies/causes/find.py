@@ -224,7 +224,9 @@ class _Study:
             raise InputError("the model's steps are not finite at the recorded states.")
         names = validation.names(x.shape[1], u.shape[1])
         self.plant = plant_of(self.model, executions[0].plan.task.dt, *names, x[usable], u[usable])
-        self.dictionary = candidates(self.plant, x[usable], u[usable], residuals[usable], outputs=self.outputs)
+        seconds = max(run.horizon for run in runs) * self.plant.dt
+        records = x[usable], u[usable], residuals[usable]
+        self.dictionary = candidates(self.plant, *records, seconds=seconds, estimated=self.outputs)
         self.loops = ClosedLoops(validation, executions)
         self.before = max(self.loops.distances)
 
