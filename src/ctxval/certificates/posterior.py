@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.special import ndtri, stdtr
+import scipy
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.checked import PositiveFloat, Probability, checked
@@ -166,7 +166,7 @@ def diagnose(
     farthest, d, code, doubt = farthest_task(covered), X.shape[1], None, None
     if surprise < LEVEL:
         others = "other trials" if unordered is not None and unordered[worst] else "trials before it"
-        deviations = -ndtri(max(exceed[worst], 1e-300))
+        deviations = -scipy.special.ndtri(max(exceed[worst], 1e-300))
         code, doubt = "surprising", withdrawals.SURPRISING.format(trial=trial, deviations=deviations, others=others)
     elif farthest > resolution:
         missing = covering(covered, resolution, 100)
@@ -187,7 +187,7 @@ def _left_out_exceedances(conditioned: Conditioned) -> Array:
     pull, diagonal = inverse @ y, np.maximum(np.diag(inverse), np.finfo(np.float64).tiny)
     freedom = n - 2
     scale2 = np.maximum(y @ pull - pull**2 / diagonal, np.finfo(np.float64).tiny) / freedom
-    return np.asarray(stdtr(freedom, -pull / np.sqrt(diagonal * scale2)))
+    return np.asarray(scipy.special.stdtr(freedom, -pull / np.sqrt(diagonal * scale2)))
 
 
 def _exceedances(conditioned: Conditioned) -> Array:
@@ -200,7 +200,7 @@ def _exceedances(conditioned: Conditioned) -> Array:
     residuals = (b[1:] - a[1:] * means[:-1]) / np.sqrt(1 + a[1:] ** 2 / precision[:-1])
     freedom = np.arange(1, len(residuals))
     scales = np.sqrt(np.cumsum(residuals**2)[:-1] / freedom)
-    return np.asarray(stdtr(freedom, -residuals[1:] / np.maximum(scales, np.finfo(np.float64).tiny)))
+    return np.asarray(scipy.special.stdtr(freedom, -residuals[1:] / np.maximum(scales, np.finfo(np.float64).tiny)))
 
 
 def _left_out(conditioned: Conditioned) -> float:
