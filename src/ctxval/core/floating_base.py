@@ -60,7 +60,7 @@ class FloatingBase(ShortRepr):
         """Return the velocity ``(..., 3)`` of a point of the base in the body frame, m/s."""
         first = self.first_velocity(x)
         velocity = in_body(self.quaternion(x), x[..., first : first + 3])
-        return velocity + np.cross(self.angular_velocity(x), at) if any(at) else velocity
+        return velocity + _cross(self.angular_velocity(x), np.asarray(at, dtype=np.float64)) if any(at) else velocity
 
     def first_velocity(self, x: Array) -> int:
         """Return the index of the first velocity in states ``(..., n)``."""
@@ -86,8 +86,13 @@ class FloatingBase(ShortRepr):
 def in_body(q: Array, v: Array) -> Array:
     """Return vectors ``(..., 3)`` of the world in the frame of unit quaternions ``(..., 4)``, w first."""
     back = -q[..., 1:]
-    twice = 2 * np.cross(back, v)
-    return np.asarray(v + q[..., :1] * twice + np.cross(back, twice))
+    twice = 2 * _cross(back, v)
+    return np.asarray(v + q[..., :1] * twice + _cross(back, twice))
+
+
+def _cross(a: Array, b: Array) -> Array:
+    # Five times as fast as np.cross for one vector, of which a policy needs several in each step.
+    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
 
 
 @checked

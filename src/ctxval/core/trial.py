@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ctxval._util.arrays import Array, read_only
-from ctxval._util.representation import ShortRepr, call, counted, line, lines, table
+from ctxval._util.representation import ShortRepr, call, counted, line, lines
 from ctxval.core.space import Point
 
 Origin = Literal["iid", "spread", "initial", "acquisition", "covering", "manual"]
@@ -93,11 +93,6 @@ class Trial:
         head = call(self, self.number, origin=self.origin, state=self.state, **ended, parameters=self.parameters)
         texts = {"failure": self.failure, "because": self.because}
         return lines(head, *(f"{name}: {line(text)}" for name, text in texts.items() if text is not None))
-
-    def _repr_html_(self) -> str:
-        names = ("origin", "state", "distance", "failure", "seconds", "attempts", "because")
-        known = ((name, getattr(self, name)) for name in names)
-        return table(f"Trial {self.number}", [*known, *self.parameters.items()])
 
 
 class Trials(tuple[Trial, ...]):
