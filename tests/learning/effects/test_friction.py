@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 
 from ctxval import Array, models
+from ctxval.core.trajectory import Transitions
 from ctxval.learning import effects
+from ctxval.learning.dry_friction import found_friction
 from ctxval.learning.effects import Joint, ModelWithEffects
 from ctxval.learning.effects.flow import Flow
 
@@ -54,3 +57,17 @@ def test_friction_at_rest_holds_more_than_friction_in_motion() -> None:
     part = DT / 8  # the first part of the step, in which the joint is still at rest
     breaks = 0.1 * part + 0.4 * (DT - part)
     np.testing.assert_allclose(rates, [0.0, breaks, 1.0 - 0.2 * DT], atol=1e-12)
+
+
+@pytest.mark.parametrize("dt", [0.02, 0.5])
+def test_the_friction_of_verdicts_has_the_same_size(dt: float) -> None:
+    model = models.Linear([[1.0, dt], [0.0, 1.0]], [[0.5 * dt**2], [dt]])
+    sticking = ModelWithEffects(model, (effects.Coulomb((0.4,), JOINT, 0.1, dt),))
+    rng, x, rows = np.random.default_rng(0), np.zeros((6, 2)), []
+    for t in range(60):
+        u = 2 * np.sin(1.8 * t * dt + np.arange(6))[:, None] + 0.5 * rng.normal(size=(6, 1)) - 0.3 * x[:, 1:]
+        rows.append((x, u, sticking.step(x, u)))
+        x = rows[-1][2]
+    found = found_friction(model, Transitions(*map(np.concatenate, zip(*rows, strict=True))))
+    assert found is not None
+    np.testing.assert_allclose(found.sliding, [0.4], rtol=1e-6)

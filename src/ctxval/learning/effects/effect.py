@@ -103,7 +103,8 @@ class Effect(ShortRepr):
 
     def python(self) -> str:
         """Return the Python expression that makes it."""
-        given = [f"{name}={value!r}" for name, value in vars(self).items() if name != "sizes"]
+        fields = [(name, value) for name, value in vars(self).items() if name != "sizes"]
+        given = [f"{name}={value:.6g}" if isinstance(value, float) else f"{name}={value!r}" for name, value in fields]
         sizes = f"({', '.join(f'{size:.6g}' for size in self.sizes)}{',' if len(self.sizes) == 1 else ''})"
         text = f"causes.{type(self).__name__}({', '.join([sizes, *given])})"
         return text.replace("Joint(rate", "causes.Joint(rate")

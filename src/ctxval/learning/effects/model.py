@@ -47,6 +47,13 @@ class ModelWithEffects(ShortRepr):
         """Whether a step has all effects."""
         return not any(effect.remembers for effect in self.effects)
 
+    @functools.cached_property
+    def draws(self) -> int:
+        """The number of draws; 0 if all sizes are numbers."""
+        return max(
+            (len(size) for each in self.effects for size in each.sizes if isinstance(size, np.ndarray)), default=0
+        )
+
     def __getitem__(self, rows: Rows) -> ModelWithEffects:
         """Return some draws."""
         sizes = ([size[rows] if isinstance(size, np.ndarray) else size for size in each.sizes] for each in self.effects)
