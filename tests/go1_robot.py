@@ -29,6 +29,7 @@ def go1_mjcf(friction: float = 0.6, payload: float = 0.0) -> str:
     floor = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [0, 0, 0.01], "friction": [friction, 0.005, 0.0001]}
     spec.worldbody.add_geom(name="floor", contype=1, conaffinity=0, priority=1, condim=3, **floor)
     spec.body("trunk").mass += payload
+    spec.add_key(name="home", qpos=list(START[:19]))
     spec.compile()
     text: str = spec.to_xml()
     return text

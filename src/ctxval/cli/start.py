@@ -12,6 +12,7 @@ from typing import Any
 from ctxval._util.files import write_text
 from ctxval._util.texts import shell_word
 from ctxval._util.toml import toml_text
+from ctxval.cli import policies
 from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, named_values, out, print_table
 from ctxval.cli.config.check import aspect1_findings, check_experiment
 from ctxval.cli.config.parts import part, plain_options
@@ -24,9 +25,21 @@ from ctxval.studies.safety.draws import spec_distance
 
 
 @command()
-def init(file: Path = Path("experiment.toml"), hardware: bool = False) -> Any:
+def init(
+    file: Path = Path("experiment.toml"),
+    hardware: bool = False,
+    policy: Path | None = None,
+    mjcf: Path | None = None,
+    descriptor: Path | None = None,
+) -> Any:
     if file.suffix != ".toml":
         raise InputError(f"an experiment file ends in .toml, got {str(file)!r}.")
+    if policy is not None:
+        if mjcf is None or hardware:
+            raise InputError("--policy needs --mjcf, the robot of the policy, and no --hardware.")
+        return _init_policy(file, policy, mjcf, descriptor)
+    if mjcf is not None or descriptor is not None:
+        raise InputError("--mjcf and --descriptor need --policy.")
     kind = "rig" if hardware else "system"
     module = "".join(c if c.isascii() and c.isalnum() else "_" for c in file.stem) + f"_{kind}"
     paths = {"experiment.toml": file, f"{kind}.py.txt": file.with_name(f"{module}.py")}
@@ -43,12 +56,23 @@ def init(file: Path = Path("experiment.toml"), hardware: bool = False) -> Any:
     for example, path in paths.items():
         text = (Path(__file__).parent / "example" / example).read_text("utf-8")
         write_text(path, Template(text).substitute(name=shell_word(file.name), about=about, system=system))
-    quoted = shell_word(file)
-    written = [str(path) for path in paths.values()]
-    out.say(" and ".join(written))
-    out.say(f"next: ctxval check {quoted}")
-    out.say(f"then: ctxval run {quoted}")
-    return {"files": written}
+    return _written(file, [*paths.values()])
+
+
+def _init_policy(file: Path, policy: Path, mjcf: Path, descriptor: Path | None) -> Any:
+    if file.exists():
+        raise InputError(f"{file} already exists and was not changed.")
+    written, guessed = policies.write_experiment(file, policy, mjcf, descriptor)
+    if guessed:
+        out.say(f"the contract of the policy is guessed: {guessed}")
+    return _written(file, written) | {"guessed": guessed or None}
+
+
+def _written(file: Path, paths: list[Path]) -> dict[str, Any]:
+    out.say(" and ".join(map(str, paths)))
+    out.say(f"next: ctxval check {shell_word(file)}")
+    out.say(f"then: ctxval run {shell_word(file)}")
+    return {"files": [str(path) for path in paths]}
 
 
 @command(tasks=model_alone.TASKS)

@@ -10,6 +10,7 @@ from ctxval.controllers.onnx_policy import OnnxPolicy, RecurrentPolicy
 from ctxval.controllers.output_feedback import EstimatedFeedback, OutputFeedback
 from ctxval.controllers.pid import PID, PIDFeedback
 from ctxval.controllers.policy_contract import Action, PolicyContract, Term
+from ctxval.controllers.policy_descriptors import convert_policy
 from ctxval.controllers.robot_policy import PolicyController, RobotPolicy
 from ctxval.core.controller import (
     AffineFeedback,
@@ -54,6 +55,7 @@ __all__ = [
     "Synthesizer",
     "Term",
     "by_name",
+    "convert_policy",
     "read_controller",
     "started",
     "write_controller",

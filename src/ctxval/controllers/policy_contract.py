@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
@@ -185,8 +186,8 @@ class PolicyContract(ShortRepr):
         return table | {"observation": [each["term"] if len(each) == 1 else each for each in observed]}
 
     def write(self, path: str | Path) -> Path:
-        """Write the contract as a TOML file, which :meth:`read` reads."""
-        table = self.to_table()
+        """Write the contract as a TOML file, which :meth:`read` reads; the path of the network is relative to it."""
+        table = self.to_table() | {"network": os.path.relpath(self.network, Path(path).parent)}
         tables = {name: table.pop(name) for name in ("observation", "action") if name in table}
         return write_text(Path(path), toml_text(table | tables))
 

@@ -62,7 +62,9 @@ def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None, 
         if isinstance(file, str) and "<" not in file:  # "<" begins a MuJoCo model that is given as text
             placed[key] = str(Path(folder or "") / file)
     arguments = {
-        key: part(declared.parts[key], value, folder) if key in declared.parts else argument(value, folder)
+        key: part(declared.parts[key], value, folder)
+        if key in declared.parts and not (isinstance(value, Mapping) and "ref" in value)
+        else argument(value, folder)
         for key, value in placed.items()
     }
     for key, value in arguments.items():
