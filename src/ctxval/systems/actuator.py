@@ -50,10 +50,8 @@ class Actuator:
         """Return the inputs that act in each step, for commanded ones ``(..., H, m)``; see :meth:`follow`."""
         late, commands = self._late, np.moveaxis(inputs, -2, 0)
         padded = np.concatenate([np.zeros((late, *commands.shape[1:])), commands])
-        due, reached = (
-            self._due([padded[late - k : len(padded) - k] for k in range(late + 1)], parts),
-            np.zeros_like(commands[0]),
-        )
+        due = self._due([padded[late - k : len(padded) - k] for k in range(late + 1)], parts)
+        reached = np.zeros_like(commands[0])
         for t in range(len(due)) if np.any(self.lag) else ():
             for k in range(parts):
                 due[t, ..., k, :], reached = self._followed(reached, due[t, ..., k, :], parts)
