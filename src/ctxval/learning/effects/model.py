@@ -135,12 +135,7 @@ class ModelWithEffects(ShortRepr):
 
     def acting(self, inputs: Array) -> Array:
         """Return the inputs that act in each step, for commanded ones ``(..., H, m)``; see :meth:`Effect.act`."""
-        memory = np.zeros((*inputs.shape[:-2], self._remembered(inputs.shape[-1])))
-        acting = []
-        for u in np.moveaxis(inputs, -2, 0):
-            u, memory = self.act(u, memory)
-            acting.append(u)
-        return np.stack(acting, axis=inputs.ndim - 2)
+        return functools.reduce(lambda inputs, effect: effect.acting(inputs), self._of_inputs, inputs)
 
     def _following(self, x: Array, acting: Array, memory: Array) -> tuple[Array, Array]:
         """Return the next states for the inputs that act, and the memory of M; without it, M begins anew."""
