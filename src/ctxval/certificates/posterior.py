@@ -12,7 +12,7 @@ Cook and Weisberg 1982).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,7 +24,6 @@ from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, farthest_task, resolved_volume
-from ctxval.certificates.forecast import forecast
 from ctxval.certificates.maxima import MAXIMA, Maxima, draw_maxima, representative, settle_maxima
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences import statements, withdrawals
@@ -50,7 +49,7 @@ class DistanceBound(CertificateKind):
 
     @checked
     def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
-        """Return the bound that d* stays below with the confidence, and a forecast if it is above the threshold."""
+        """Return the bound that d* stays below with the confidence."""
         threshold = sample.threshold
         far = (farthest := farthest_task(sample.points)) > self.resolution
         # Many trials that do not cover the tasks are refused before the draws, which take long.
@@ -62,10 +61,7 @@ class DistanceBound(CertificateKind):
             )
         # A bound that is withdrawn in any case need not be told from the threshold.
         drawn = draw_maxima(sample) if threshold is None or far else settle_maxima(sample, threshold, confidence)
-        certificate = self.certify_drawn(sample, drawn, confidence)
-        if threshold is None or certificate.doubt is not None or certificate.upper_bound <= threshold:
-            return certificate  # a process that the trials contradict predicts nothing
-        return replace(certificate, expected=forecast(representative(sample), drawn, threshold, confidence))
+        return self.certify_drawn(sample, drawn, confidence)
 
     @checked
     def certify_drawn(self, sample: Sample, drawn: Maxima, confidence: Probability = 0.95) -> Certificate:
