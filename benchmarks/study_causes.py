@@ -16,10 +16,11 @@ from calibrate import RESULTS
 from causes_robots import DEVELOPMENT, REPORTING
 from causes_systems import Fault, Robot, faults_of, foreign_of
 from ctxval import Campaign, searches
-from ctxval._util.json_lines import JsonLines
 from ctxval.errors import InputError
-from ctxval.studies import causes
-from ctxval.studies.causes import Cause, find_causes
+from ctxval.learning import effects
+from ctxval.learning.effects import Effect
+from ctxval.studies.causes import find_causes
+from json_lines import JsonLines
 
 RULE = 5
 """The number of the rule by which causes are found and named, and of the way in which faults are simulated.
@@ -44,25 +45,25 @@ def faults(robot: Robot, of: str) -> list[Fault]:
     return [*faults_of(robot, COUNTS[of]), *foreign_of(robot)]
 
 
-def is_right(robot: Robot, fault: Fault, cause: Cause) -> bool:
+def is_right(robot: Robot, fault: Fault, cause: Effect) -> bool:
     """Return whether a cause is the fault, at its place."""
     place, compiled = fault.place, getattr(robot.model, "compiled", None)
     joints = robot.joints if compiled is None else compiled.nq
     attributes = {"viscous friction": "damping", "Coulomb friction": "frictionloss", "armature": "armature"}
-    if isinstance(cause, causes.JointAttribute):
+    if isinstance(cause, effects.JointAttribute):
         return attributes.get(fault.kind) == cause.attribute and cause.joint.dof == place
     weight = robot.constant_weight(place) if fault.kind == "gravity" else None
-    if weight is not None and isinstance(cause, causes.Bias):  # this is the same
+    if weight is not None and isinstance(cause, effects.Bias):  # this is the same
         return cause.joint.rate == joints + place and cause.joint.input is None
     if cause.name != fault.kind:
         return False
-    if isinstance(cause, causes.BodyMass):
+    if isinstance(cause, effects.BodyMass):
         return cause.body == place
-    if isinstance(cause, causes.SensorOffset):
+    if isinstance(cause, effects.SensorOffset):
         return cause.state == place
-    if isinstance(cause, causes.SensorScale):
+    if isinstance(cause, effects.SensorScale):
         return cause.states[0] == place
-    if isinstance(cause, causes.Gravity):  # that of the whole robot
+    if isinstance(cause, effects.Gravity):  # that of the whole robot
         return {joints + j for j in robot.weights} <= {joint.rate for joint in cause.joints}
     if hasattr(cause, "joint"):
         driven = cause.joint.input is None or robot.driven[cause.joint.input] == place
@@ -70,10 +71,10 @@ def is_right(robot: Robot, fault: Fault, cause: Cause) -> bool:
     return getattr(cause, "input", place) == place
 
 
-def size_error(robot: Robot, fault: Fault, cause: Cause) -> float | None:
+def size_error(robot: Robot, fault: Fault, cause: Effect) -> float | None:
     """Return the largest relative error of a size; of ratios, that of their difference from 1."""
     weight = robot.constant_weight(fault.place) if fault.kind == "gravity" else None
-    if weight is not None and isinstance(cause, causes.Bias):
+    if weight is not None and isinstance(cause, effects.Bias):
         return abs(cause.sizes[0] / (weight * (fault.sizes[0] - 1)) - 1)
     if not fault.sizes:
         return 0.0
@@ -94,7 +95,7 @@ def measured(robot: Robot, fault: Fault, noise: float) -> dict[str, Any]:
         failed = {"named": False, "rank": None, "in_group": False, "size_error": None, "sentence": str(error)}
         return {**known, "executions": len(campaign.completed), **failed, "seconds": 0.0}
     listed = [each.causes for each in report.explained]
-    listed += [each.repaired.causes for each in report.ranked]
+    listed += [each.repaired.effects for each in report.ranked]
     distinct = list(dict.fromkeys(tuple(cause.with_sizes(()) for cause in each) for each in listed))
     places = [k for k, each in enumerate(distinct) if any(is_right(robot, fault, cause) for cause in each)]
     right = [cause for each in report.explained for cause in each.causes if is_right(robot, fault, cause)]
@@ -128,8 +129,8 @@ def on_servo(seed: int) -> dict[str, Any]:
     return {
         "rule": RULE,
         "seed": seed,
-        "first": type(report.ranked[0].repaired.causes[0]).__name__,
-        "sizes": list(report.ranked[0].repaired.causes[0].sizes),
+        "first": type(report.ranked[0].repaired.effects[0]).__name__,
+        "sizes": list(report.ranked[0].repaired.effects[0].sizes),
         "named": report.named,
         "share": first.share if first else 0.0,
         "sentence": report.sentence,

@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import causes_page
 from causes_robots import DEVELOPMENT, REPORTING
 from causes_systems import Fault, faults_of, foreign_of
-from ctxval.studies import causes
+from ctxval.learning import effects
 from rig_thorough import some
 from study_causes import is_right, size_error
 
@@ -41,20 +41,20 @@ def test_faults_are_seeded_and_of_different_kinds() -> None:
 
 def test_a_cause_is_right_only_at_its_place() -> None:
     arm = REPORTING["arm"]
-    joint = causes.Joint(rate=2, position=0, input=0)
-    assert is_right(arm, Fault("Coulomb friction", 0, (1.0,)), causes.Coulomb((1.05,), joint))
-    assert not is_right(arm, Fault("Coulomb friction", 1, (1.0,)), causes.Coulomb((1.05,), joint))
-    assert not is_right(arm, Fault("viscous friction", 0, (1.0,)), causes.Coulomb((1.05,), joint))
-    assert size_error(arm, Fault("Coulomb friction", 0, (1.0,)), causes.Coulomb((1.05,), joint)) == pytest.approx(0.05)
-    assert size_error(arm, Fault("input gain", 0, (0.8,)), causes.InputGain((0.78,), 0)) == pytest.approx(0.1)
+    joint = effects.Joint(rate=2, position=0, input=0)
+    assert is_right(arm, Fault("Coulomb friction", 0, (1.0,)), effects.Coulomb((1.05,), joint))
+    assert not is_right(arm, Fault("Coulomb friction", 1, (1.0,)), effects.Coulomb((1.05,), joint))
+    assert not is_right(arm, Fault("viscous friction", 0, (1.0,)), effects.Coulomb((1.05,), joint))
+    assert size_error(arm, Fault("Coulomb friction", 0, (1.0,)), effects.Coulomb((1.05,), joint)) == pytest.approx(0.05)
+    assert size_error(arm, Fault("input gain", 0, (0.8,)), effects.InputGain((0.78,), 0)) == pytest.approx(0.1)
 
 
 def test_a_weight_that_is_a_constant_force_is_a_bias() -> None:
     quadrotor, fault = REPORTING["quadrotor"], Fault("gravity", 1, (1.2,))
-    bias = causes.Bias((-1.9,), causes.Joint(rate=4, position=1))
+    bias = effects.Bias((-1.9,), effects.Joint(rate=4, position=1))
     assert is_right(quadrotor, fault, bias)
     assert size_error(quadrotor, fault, bias) == pytest.approx(1 - 1.9 / (0.2 * 9.81))
-    assert not is_right(REPORTING["arm"], Fault("gravity", 0, (1.2,)), causes.Bias((-1.9,), causes.Joint(rate=2)))
+    assert not is_right(REPORTING["arm"], Fault("gravity", 0, (1.2,)), effects.Bias((-1.9,), effects.Joint(rate=2)))
 
 
 def test_the_page_is_that_of_the_stored_results() -> None:

@@ -19,7 +19,7 @@ from ctxval.campaign.telling import SuppliedResult
 from ctxval.core.trial import Trial
 from ctxval.data import LogMapping
 from ctxval.errors import InputError
-from ctxval.studies.causes.signals import SeeingLate
+from ctxval.learning.effects.transport import SeeingLate
 from facts import assert_names, refuses
 
 

@@ -8,14 +8,14 @@ from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, far
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
 from ctxval.certificates.evidence import Evidence, Learned
 from ctxval.certificates.expiry import WatchState
-from ctxval.certificates.forecast import Forecast, forecast
+from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.posterior import Diagnosis, DistanceBound, diagnose, instantaneous_bound
 from ctxval.certificates.predictions import CheckedPrediction
 from ctxval.certificates.provenance import Neighbour, Provenance
 from ctxval.certificates.sample import PLANNED, RecoveredFailure, Sample, require_learned
-from ctxval.certificates.scenario import Audit, Region, SamplingDiscarding, Scenario, samples_needed, tail, volume_bound
+from ctxval.certificates.scenario import Audit, SamplingDiscarding, Scenario, samples_needed, tail, volume_bound
 from ctxval.certificates.stopping import StoppingDecision, StoppingRule
 from ctxval.certificates.verdict import Assessment, Verdict, assess, judge, judge_by
 from ctxval.core.coverage import StateInputCoverage, StateInputGap, UnsampledCorner, UnsampledParameter
@@ -42,7 +42,6 @@ __all__ = [
     "Neighbour",
     "Provenance",
     "RecoveredFailure",
-    "Region",
     "Sample",
     "SamplingDiscarding",
     "Scenario",
@@ -62,7 +61,6 @@ __all__ = [
     "diagnose",
     "draw_maxima",
     "farthest_task",
-    "forecast",
     "instantaneous_bound",
     "is_validated",
     "judge",

@@ -26,8 +26,8 @@ from ctxval.cli.config.parts import TaskTable, part, recorded
 from ctxval.cli.config.settings import ExperimentSettings, read_settings
 from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import CtxvalError, ExecutionError, InputError
-from ctxval.testing import FaultyRig
 from facts import assert_names, is_named, refuses, warns
+from faulty_rig import FaultyRig
 from rig_thorough import more
 
 
@@ -612,10 +612,8 @@ def test_no_name_leaves_the_folder_of_the_stores(name: str, file: str) -> None:
         ("distance", {"type": "AtTimes", "times": [99.0]}),
         ("distance", {"type": "FinalState", "components": ["speed"]}),
         ("distance", {"type": "AtCrossing", "crossings": 0}),
-        ("certificate", {"kind": "region", "predictions": 0}),
-        ("certificate", {"kind": "region", "discard": -1}),
+        ("certificate", {"kind": "sampling-discarding", "discard": -1}),
         ("certificate", {"kind": "sampling-discarding"}),
-        ("certificate", {"kind": "region", "discard": 9}),
         ("search", {"name": "gp-ucb", "beta": -1.0}),
         ("search", {"name": "cma-es", "population": 0}),
         ("synthesizer", {"type": "ILQR", "Q": [1.0], "R": [1.0], "iterations": 0}),

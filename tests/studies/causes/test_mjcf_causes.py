@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 
 from ctxval import Campaign, Parameters, Task, TaskSpace, Validation, controllers, distances, models, searches, systems
-from ctxval.studies import causes
-from ctxval.studies.causes import CauseReport, Joint, find_causes
-from ctxval.studies.causes.cause import plant_of
-from ctxval.studies.causes.flow import Flow
+from ctxval.studies.causes import CauseReport, find_causes
 from rig_thorough import more
 
 pytest.importorskip("mujoco")
@@ -56,36 +53,3 @@ def test_the_attribute_that_differs_is_found(true: str, line: str, says: str) ->
     assert found.named
     assert says.lower() in found.sentence.lower()
     assert any(each.startswith(line) for each in found.mjcf)
-
-
-def test_a_changed_copy_leaves_the_model_as_it_is() -> None:
-    model = models.MuJoCo(mjcf(), dt=DT)
-    x, u = np.array([0.3, 1.0]), np.array([0.5])
-    before = model.step(x, u)
-    sticking = causes.JointAttribute((0.2,), "frictionloss", Joint(1, 0, 1.0, 0, 0)).model(model)
-    np.testing.assert_array_equal(model.step(x, u), before)
-    expected = models.MuJoCo(mjcf('frictionloss="0.2"'), dt=DT).step(x, u)
-    np.testing.assert_allclose(sticking.step(x, u), expected, atol=1e-9)
-    pushed = model.changed(forces=np.array([0.1])).step(x, u)
-    np.testing.assert_allclose(pushed, model.step(x, np.array([0.6])), atol=1e-12)
-
-
-def test_the_load_of_the_gears_is_what_the_motor_and_gravity_push_against() -> None:
-    model, angles, torques = models.MuJoCo(mjcf(), dt=DT), np.array([0.4, -0.9, np.nan]), np.array([0.5, -0.2, 0.1])
-    friction = causes.LoadFriction((0.5, 0.01), Joint(1, 0, 1.0, 0, 0), 0.1, DT)
-    load = friction.load(Flow.of(model, np.stack([angles, 0 * angles], axis=-1), torques[:, None]))
-    needed = 0.5 * 9.81 * 0.25 * np.sin(angles)  # to hold the link against gravity
-    np.testing.assert_allclose(load, np.abs(torques + needed), rtol=1e-6)
-    # A link at rest that friction can hold stays at rest.
-    held = causes.LoadFriction((2.0, 0.0), friction.joint, 0.1, DT)
-    repaired = causes.Repaired(model, (held,))
-    np.testing.assert_allclose(repaired.step(np.array([0.4, 0.0]), np.array([0.5])), [0.4, 0.0], atol=1e-6)
-
-
-def test_joints_and_units_are_those_of_the_model() -> None:
-    rng, model = np.random.default_rng(0), models.MuJoCo(mjcf(), dt=DT)
-    plant = plant_of(model, DT, {"x0": "", "x1": ""}, {"u0": ""}, rng.normal(size=(9, 2)), rng.normal(size=(9, 1)))
-    (joint,) = plant.joints
-    assert (joint.position, joint.rate, joint.input, joint.dof) == (0, 1, 0, 0)
-    assert (plant.joint_name(joint), plant.force_unit(joint), plant.rate_unit(joint)) == ("hinge", "N m", "rad/s")
-    assert causes.InputGain((0.5,), 0).mjcf(plant) == '<motor name="motor" gear="0.5"/>'

@@ -9,7 +9,7 @@ from conftest import make_validation
 from ctxval import Campaign, refine, searches, systems
 from ctxval.core.model import Step
 from ctxval.errors import InputError
-from ctxval.studies.causes import Repaired
+from ctxval.learning.effects import ModelWithEffects
 from ctxval.studies.refinement import CauseRepair
 from ctxval.studies.refinement.methods import method_of
 from facts import refuses
@@ -28,9 +28,9 @@ def test_the_repaired_model_is_validated_under_its_own_controllers() -> None:
     assert first is not None
     assert first.distance is not None
     result = refine(campaign, 0.1 * first.distance, 5, method=CauseRepair(campaign))
-    assert isinstance(result.model, Repaired)
-    (cause,) = result.model.causes
-    assert cause.sizes == pytest.approx([0.5], rel=1e-4)
+    assert isinstance(result.model, ModelWithEffects)
+    (effect,) = result.model.effects
+    assert effect.sizes == pytest.approx([0.5], rel=1e-4)
     assert result.last.worst is not None
     assert result.last.worst < 1e-3 * first.distance
     assert "offset" in " ".join(result.last.notes)
@@ -40,7 +40,7 @@ def test_the_repaired_model_is_validated_under_its_own_controllers() -> None:
 def test_an_error_without_a_known_cause_ends_the_refinement() -> None:
     model = make_validation().model
     campaign = executed(lambda x, u: model.step(x, u) + 0.02 * np.sin(60 * x))
-    with refuses(InputError, 19):
+    with refuses(InputError, 22):
         refine(campaign, 1e-6, 6, method=CauseRepair(campaign))
 
 

@@ -1,67 +1,9 @@
-"""Why a model fails: the causes of its error, with their sizes in physical units."""
+"""Why a model fails: the effects that it lacks, with their sizes in physical units."""
 
-from ctxval.studies.causes.cause import Cause, Joint, Repaired
+from ctxval.learning import effects
+from ctxval.learning.effects import *  # noqa: F403
 from ctxval.studies.causes.find import find_causes
-from ctxval.studies.causes.mechanics import (
-    Bias,
-    BodyMass,
-    Coulomb,
-    Gravity,
-    Inertia,
-    JointAttribute,
-    LoadFriction,
-    MassCentre,
-    Stribeck,
-    TimeStep,
-    Viscous,
-)
 from ctxval.studies.causes.report import CauseReport
-from ctxval.studies.causes.signals import (
-    Backlash,
-    DeadZone,
-    Delay,
-    InputGain,
-    InputOffset,
-    Lag,
-    ObservationDelay,
-    ReversedInput,
-    Saturation,
-    SensorOffset,
-    SensorScale,
-    SwappedInputs,
-    SwappedJoints,
-    WrappedAngle,
-)
 
-__all__ = [
-    "Backlash",
-    "Bias",
-    "BodyMass",
-    "Cause",
-    "CauseReport",
-    "Coulomb",
-    "DeadZone",
-    "Delay",
-    "Gravity",
-    "Inertia",
-    "InputGain",
-    "InputOffset",
-    "Joint",
-    "JointAttribute",
-    "Lag",
-    "LoadFriction",
-    "MassCentre",
-    "ObservationDelay",
-    "Repaired",
-    "ReversedInput",
-    "Saturation",
-    "SensorOffset",
-    "SensorScale",
-    "Stribeck",
-    "SwappedInputs",
-    "SwappedJoints",
-    "TimeStep",
-    "Viscous",
-    "WrappedAngle",
-    "find_causes",
-]
+__all__ = ["CauseReport", "find_causes"]
+__all__ += effects.__all__

@@ -19,11 +19,15 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError
+from ctxval.learning.effects.dictionary import candidates
+from ctxval.learning.effects.effect import Effect, EffectCandidate
+from ctxval.learning.effects.fit import Explanation, Segments, SegmentSettings, explained, screened
+from ctxval.learning.effects.force import Force
+from ctxval.learning.effects.model import ModelWithEffects
+from ctxval.learning.effects.plant import plant_of
+from ctxval.learning.effects.sensor import SensorOffset, wrapped_angles
+from ctxval.learning.effects.transport import ObservationDelay
 from ctxval.learning.extended import estimates_by_loops_on_model
-from ctxval.models import MuJoCo
-from ctxval.studies.causes import mechanics, signals
-from ctxval.studies.causes.cause import Cause, CauseCandidate, Plant, Repaired, of_size, plant_of
-from ctxval.studies.causes.evidence import Evidence, EvidenceSettings, Explanation, explained, screened
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
 
 
@@ -70,7 +74,7 @@ class ClosedLoops:
         self.without = [self._deviation(each.executed, loop) for each, loop in pairs]
         self.distances = [self._distance(each, loop) for each, loop in pairs]
 
-    def predicted(self, repaired: Repaired, execution: ExecutedTask, noise: Array) -> Predicted:
+    def predicted(self, repaired: ModelWithEffects, execution: ExecutedTask, noise: Array) -> Predicted:
         """Return the prediction of an execution from where it began: the mean of loops with noise.
 
         Noise of measurements, white with standard deviations ``(n,)``, acts on the system through the controller, and
@@ -88,13 +92,15 @@ class ClosedLoops:
         by_noise = np.array([self._deviation(loop, mean) for loop in loops]) * (len(loops) + 1) / max(len(loops) - 1, 1)
         return Predicted(self._deviation(execution.executed, mean), by_noise, self._distance(execution, mean))
 
-    def distance_from_tasks(self, repaired: Repaired) -> float | None:
+    def distance_from_tasks(self, repaired: ModelWithEffects) -> float | None:
         """Return the largest distance of executions from loops that begin where tasks begin; None if a loop fails."""
         loops = ((each, self.of_plan(repaired, each.plan, each.executed.horizon)) for each in self.executions)
         largest = max(np.inf if loop is None else self._distance(each, loop) for each, loop in loops)
         return largest if np.isfinite(largest) else None
 
-    def of_plan(self, repaired: Repaired, plan: Plan, steps: int, start: Array | None = None) -> Trajectory | None:
+    def of_plan(
+        self, repaired: ModelWithEffects, plan: Plan, steps: int, start: Array | None = None
+    ) -> Trajectory | None:
         """Return the first steps of a plan's closed loop on a model with causes, without noise; None if it fails."""
         system: System = repaired
         if self.validation.outputs is not None:
@@ -106,7 +112,7 @@ class ClosedLoops:
         loop = loop.first(steps)
         return loop if loop.finite.all() else None
 
-    def _noisy(self, repaired: Repaired, execution: ExecutedTask, noise: Array) -> list[Trajectory]:
+    def _noisy(self, repaired: ModelWithEffects, execution: ExecutedTask, noise: Array) -> list[Trajectory]:
         """Return loops with noise; none if there is no noise, or if one fails."""
         if not noise.any():
             return []
@@ -199,33 +205,35 @@ class _Study:
         horizon = min(len(run.inputs) for run in runs)
         # What inputs and jumps of the records tell is known, and not fitted.
         old = observation_delay([(each.plan.controller, each.plan.task, each.executed) for each in executions])
-        late = [CauseCandidate(signals.ObservationDelay(steps=old))] if old else []
+        late = [EffectCandidate(ObservationDelay(steps=old))] if old else []
         with np.errstate(all="ignore"):
             following = [np.asarray(self.model.step(*map(np.array, (run.states[:-1], run.inputs)))) for run in runs]
-        self.known = (*late, *signals.wrapped_angles([run.states for run in runs], following))
-        known = tuple(each.cause for each in self.known)
+        self.known = (*late, *wrapped_angles([run.states for run in runs], following))
+        known = tuple(each.effect for each in self.known)
         # Estimated states are worth little in one step.
-        long = EvidenceSettings((max(1, horizon // 60), max(1, horizon // 12)))
-        taken = long if self.outputs else EvidenceSettings()
-        self.evidence = Evidence(self.model, runs, settings=taken, known=known)
-        floors = [window.floors for window in self.evidence.windows]
-        self.some = Evidence(self.model, runs, floors, (200, 40), taken, known)  # all causes are screened on these
+        long = SegmentSettings((max(1, horizon // 60), max(1, horizon // 12)))
+        taken = long if self.outputs else SegmentSettings()
+        self.segments = Segments(self.model, runs, settings=taken, known=known)
+        floors = [window.floors for window in self.segments.windows]
+        self.some = Segments(self.model, runs, floors, (200, 40), taken, known)  # all causes are screened on these
         without = (runs[:k] + runs[k + 1 :] for k in range(len(runs)))
-        self.others = [Evidence(self.model, rest, floors, settings=taken, known=known) for rest in without]
-        x, u, residuals = self.evidence.pairs
+        self.others = [Segments(self.model, rest, floors, settings=taken, known=known) for rest in without]
+        x, u, residuals = self.segments.pairs
         usable = np.isfinite(residuals).all(axis=1)
         if not usable.any():
             raise InputError("the model's steps are not finite at the recorded states.")
         names = validation.names(x.shape[1], u.shape[1])
         self.plant = plant_of(self.model, executions[0].plan.task.dt, *names, x[usable], u[usable])
-        self.dictionary = candidates(self.plant, x[usable], u[usable], residuals[usable], outputs=self.outputs)
+        seconds = max(run.horizon for run in runs) * self.plant.dt
+        records = x[usable], u[usable], residuals[usable]
+        self.dictionary = candidates(self.plant, *records, seconds=seconds, estimated=self.outputs)
         self.loops = ClosedLoops(validation, executions)
         self.before = max(self.loops.distances)
 
     def report(self, most: int) -> CauseReport:
         first = None
         if self.known or not self.outputs:
-            known = Repaired(self.model, tuple(each.cause for each in self.known))
+            known = ModelWithEffects(self.model, tuple(each.effect for each in self.known))
             first = self._in_closed_loop(Explanation(self.known, known, 0.0, 1.0))
         if first is not None and first.complete >= self.settings.named:
             if self.known:
@@ -254,7 +262,7 @@ class _Study:
             chosen, alike = first, []
         return self._reported([] if chosen is None else [chosen, *alike], ranked, False)
 
-    def _fitted(self, chosen: Explained) -> tuple[CauseCandidate, ...]:
+    def _fitted(self, chosen: Explained) -> tuple[EffectCandidate, ...]:
         return chosen.explanation.candidates[len(self.known) :]
 
     def _reported(self, group: list[Explained], ranked: list[Explanation], began_elsewhere: bool) -> CauseReport:
@@ -282,25 +290,24 @@ class _Study:
         gap = float(gaps[:, state].mean())
         alike = np.ptp(gaps[:, state]) < 0.5 * abs(gap)
         for each in self.dictionary:
-            if alike and isinstance(each.cause, signals.SensorOffset) and each.cause.state == state:
-                repaired = Repaired(self.model, (each.cause.with_sizes([gap]),))
-                return Explanation((replace(each, cause=repaired.causes[0]),), repaired, 0.0, 1.0)
+            if alike and isinstance(each.effect, SensorOffset) and each.effect.state == state:
+                repaired = ModelWithEffects(self.model, (each.effect.with_sizes([gap]),))
+                return Explanation((replace(each, effect=repaired.effects[0]),), repaired, 0.0, 1.0)
         return None
 
-    def _ranked(self, beside: tuple[CauseCandidate, ...]) -> list[Explanation]:
+    def _ranked(self, beside: tuple[EffectCandidate, ...]) -> list[Explanation]:
         """Return explanations by each cause beside given ones, the most probable first; the best of a screening."""
-        kinds = [each.cause.kind for each in beside]
+        kinds = [each.effect.kind for each in beside]
         results = []
         for each in self.dictionary:
             together = (*self.known, *beside, each)
-            within = [other for other in together if not getattr(other.cause, "held", True)]
-            if each.cause.kind not in kinds and len(within) < 2:
+            if each.effect.kind not in kinds and sum(other.effect.in_parts for other in together) < 2:
                 results.append((*screened(self.some, together), together))
             advance(1)
         results.sort(key=lambda result: result[0])
         # What comes to less than a quarter of the evidence of the best one is not worth a fit.
         worth = [result for result in results[: self.settings.fitted] if result[0] <= 0.25 * results[0][0]]
-        refined = [explained(self.evidence, together, begun) for _, begun, together in worth or results[:1]]
+        refined = [explained(self.segments, together, begun) for _, begun, together in worth or results[:1]]
         distinct = list[Explanation]()
         for explanation in sorted(refined, key=lambda each: each.criterion):
             if not any(_is_same(explanation, other) for other in distinct):
@@ -331,12 +338,14 @@ class _Study:
         others.sort(key=lambda each: len(each.sizes))  # the simplest are tried first
         group = [best, *(self._in_closed_loop(each) for each in others[: self.settings.checked])]
         group = [each for each in group if 1 - each.share <= 2 * (1 - best.share) + 1e-3]
-        first = min((each for each in group if each.counts(self.before)), key=lambda each: len(each.explanation.sizes))
+        # The fewest sizes; and a real actuator acts late by parts of a step, not by means over whole ones.
+        counting = [each for each in group if each.counts(self.before)]
+        first = min(counting, key=lambda each: (len(each.explanation.sizes), not any(c.in_parts for c in each.causes)))
         return first, [each for each in group if each is not first and not _contains(each, first)]
 
     def _in_closed_loop(self, explanation: Explanation) -> Explained:
         """Return how well causes predict each execution if they are fitted to the others."""
-        noise = np.zeros(self.evidence.states.shape[1]) if self.outputs else self.evidence.noise(explanation.repaired)
+        noise = np.zeros(self.segments.states.shape[1]) if self.outputs else self.segments.noise(explanation.repaired)
         predicted, sizes = list[Predicted](), []
         for execution, others in zip(self.executions, self.others, strict=True):
             fitted = explained(others, explanation.candidates, explanation.sizes, near=True)
@@ -347,7 +356,7 @@ class _Study:
         left = float(np.sum([each.deviation for each in predicted])) - by_noise
         # Without any effect beside noise, what is left says only whether it is more than noise.
         before = max(float(np.sum(self.loops.without)) - by_noise, spread, 1e-300)
-        structure, uncertain = self.evidence.explained(explanation.repaired, noise)
+        structure, uncertain = self.segments.explained(explanation.repaired, noise)
         return Explained(
             explanation,
             share=1 - max(left, 0.0) / before,
@@ -378,31 +387,19 @@ class _Study:
         return best
 
 
-def candidates(plant: Plant, x: Array, u: Array, residuals: Array, *, outputs: bool) -> tuple[CauseCandidate, ...]:
-    """Return the dictionary of a plant for recorded states and inputs, and what M misses of next states ``(N, n)``."""
-    missed = np.sqrt([(column**2).mean() for column in residuals.T])
-    return (
-        *signals.of_inputs(plant),
-        *(candidate for joint in plant.ports for candidate in mechanics.forces(plant, joint, x, u, missed)),
-        *(mechanics.of_mujoco(plant, missed) if isinstance(plant.model, MuJoCo) else mechanics.of_joints(plant)),
-        of_size(mechanics.TimeStep((1.0,)), 0.2, 5.0, 0.1, 0.5, 0.95, 1.05, 2.0),
-        *(() if outputs else signals.of_sensors(plant, x)),  # states that are estimated have no sensors
-    )
-
-
-def _unsized(candidate: CauseCandidate) -> Cause:
-    return replace(candidate.cause, sizes=())
+def _unsized(candidate: EffectCandidate) -> Effect:
+    return replace(candidate.effect, sizes=())
 
 
 def _is_same(explanation: Explanation, other: Explanation) -> bool:
     """Return whether causes of the same kinds have the same sizes: in fine sampling, a delay may be held or not."""
-    kinds = [[cause.kind for cause in each.repaired.causes] for each in (explanation, other)]
+    kinds = [[cause.kind for cause in each.repaired.effects] for each in (explanation, other)]
     return kinds[0] == kinds[1] and np.allclose(explanation.sizes, other.sizes, rtol=0.02)
 
 
 def _contains(general: Explained, special: Explained) -> bool:
     """Return whether an explanation has another one as a special case, as Stribeck friction has Coulomb friction."""
     ends = general.causes[-1], special.causes[-1]
-    forces = [cause for cause in ends if isinstance(cause, mechanics.Force)]
+    forces = [cause for cause in ends if isinstance(cause, Force)]
     more = len(general.explanation.sizes) > len(special.explanation.sizes)
     return more and len(forces) == 2 and forces[0].joint.rate == forces[1].joint.rate

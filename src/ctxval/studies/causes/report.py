@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.representation import ShortRepr, call, line, lines, task_text
-from ctxval.studies.causes.cause import Cause, Plant, Repaired
-from ctxval.studies.causes.evidence import Explanation
+from ctxval.learning.effects import Effect, ModelWithEffects
+from ctxval.learning.effects.fit import Explanation
+from ctxval.learning.effects.plant import Plant
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +27,9 @@ class Explained(ShortRepr):
     spreads: tuple[float, ...]  #: the range of each size if one execution is left out
 
     @property
-    def causes(self) -> tuple[Cause, ...]:
+    def causes(self) -> tuple[Effect, ...]:
         """The causes with their sizes."""
-        return self.explanation.repaired.causes
+        return self.explanation.repaired.effects
 
     @property
     def resolved(self) -> bool:
@@ -78,12 +79,12 @@ class CauseReport(ShortRepr):
     ranked: tuple[Explanation, ...] = ()  #: the most probable causes alone, the best one first
 
     @property
-    def causes(self) -> tuple[Cause, ...]:
+    def causes(self) -> tuple[Effect, ...]:
         """The causes that are named; empty if there are none."""
         return self.explained[0].causes if self.named else ()
 
     @property
-    def repaired(self) -> Repaired | None:
+    def repaired(self) -> ModelWithEffects | None:
         """M with the named causes in it; None if no cause is named."""
         return self.explained[0].explanation.repaired if self.named else None
 
@@ -127,7 +128,7 @@ class CauseReport(ShortRepr):
         return f"{what[0].upper()}{what[1:]}. With {together} in M, {effect}. This explains {share}."
 
     def _text(self, each: Explained) -> str:
-        return " and ".join(cause.text(self.plant) for cause in each.causes)
+        return " and ".join(cause.sentence(self.plant) for cause in each.causes)
 
     @property
     def separating_sentence(self) -> str | None:
@@ -148,13 +149,23 @@ class CauseReport(ShortRepr):
         if not self.named:
             return None
         made = "".join(f"    {cause.python()},\n" for cause in self.causes)
-        return f"from ctxval.studies import causes\n\nmodel = causes.Repaired(model, (\n{made}))"
+        repaired = self.explained[0].explanation.repaired
+        inputs = "" if repaired.complete else f", inputs={repaired.inputs}"
+        return f"from ctxval.studies import causes\n\nmodel = causes.ModelWithEffects(model, (\n{made}){inputs})"
 
     @property
     def mjcf(self) -> tuple[str, ...]:
         """The lines of MJCF that put the causes into a MuJoCo model; empty if there are none."""
-        changes = (cause.mjcf(self.plant) for cause in self.causes)
-        return tuple(each for each in changes if each is not None)
+        return self._lines("mjcf")
+
+    @property
+    def urdf(self) -> tuple[str, ...]:
+        """The lines of URDF with the named causes, for elements of the same robot; empty if there are none."""
+        return self._lines("urdf")
+
+    def _lines(self, language: str) -> tuple[str, ...]:
+        repairs = (cause.repair(self.plant) for cause in self.causes)
+        return tuple(each[language] for each in repairs if language in each)
 
     def to_json(self) -> dict[str, Any]:
         """Return everything as plain values."""
@@ -181,6 +192,7 @@ class CauseReport(ShortRepr):
             "units": self.units,
             "python": self.python,
             "mjcf": list(self.mjcf),
+            "urdf": list(self.urdf),
         }
 
     def __repr__(self) -> str:

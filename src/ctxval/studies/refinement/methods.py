@@ -20,12 +20,14 @@ from ctxval.core.model import Model, Step, as_model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import CtxvalError, InputError, ModelError, UnknownNameError
 from ctxval.learning import PosteriorSettings, learn_posterior
+from ctxval.learning.effects import ModelWithEffects
+from ctxval.learning.effects.fit import Segments, explained
 from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.innovations import fit_lagged
 from ctxval.learning.residual_data import floors
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.parametric import ParametricStep
-from ctxval.studies.causes import CauseReport, Repaired, evidence, find_causes
+from ctxval.studies.causes import CauseReport, find_causes
 from ctxval.studies.fitting import FittedParameter, fit_parameters
 from ctxval.studies.fitting.fit import as_bounds, learned_model
 from ctxval.studies.refinement.held_out import HeldOut, Records, held_out
@@ -110,7 +112,7 @@ class CauseRepair(ShortRepr, Method):
 
     campaign: Campaign
     name: str = field(default="causes", init=False)
-    makes = Repaired
+    makes = ModelWithEffects
 
     @functools.cached_property
     def report(self) -> CauseReport:
@@ -128,15 +130,15 @@ class CauseRepair(ShortRepr, Method):
             raise InputError("the method 'causes' needs recorded states of M, and only outputs are recorded.")
         best = self.report.explained[0].explanation
 
-        def repaired(some: Records) -> Repaired:
+        def repaired(some: Records) -> ModelWithEffects:
             if not some.executed:
                 raise InputError("the method 'causes' needs executions with trajectories.")
             with single_threaded():
-                executed = evidence.Evidence(model, some.executed, known=best.repaired.causes)
-                return evidence.explained(executed, best.candidates, best.sizes).repaired
+                segments = Segments(model, some.executed, known=best.repaired.effects)
+                return explained(segments, best.candidates, best.sizes).repaired
 
         learned = repaired(records)
-        note = " and ".join(cause.text(self.report.plant) for cause in learned.causes)
+        note = " and ".join(effect.sentence(self.report.plant) for effect in learned.effects)
         return Learned(learned, held_out(repaired, model, records), (note,))
 
 
