@@ -41,21 +41,21 @@ class Actuator:
         commands = np.concatenate([u, memory[..., : late * m]], axis=-1)
         acting = self._due([commands[..., k * m : (k + 1) * m] for k in range(late + 1)], parts)
         kept, reached = commands[..., : late * m], memory[..., late * m :]
-        if reached.shape[-1]:
-            for k in range(parts):
-                acting[..., k, :], reached = self._followed(reached, acting[..., k, :], parts)
+        for k in range(parts) if reached.shape[-1] else ():
+            acting[..., k, :], reached = self._followed(reached, acting[..., k, :], parts)
         acting = acting[..., 0, :] if parts == 1 else acting
         return acting, np.concatenate([kept, reached], axis=-1)
 
-    def acting(self, inputs: Array) -> Array:
-        """Return the inputs that act in each step, for commanded ones ``(..., H, m)``."""
+    def acting(self, inputs: Array, parts: int = 1) -> Array:
+        """Return the inputs that act in each step, for commanded ones ``(..., H, m)``; see :meth:`follow`."""
         late, commands = self._late, np.moveaxis(inputs, -2, 0)
         padded = np.concatenate([np.zeros((late, *commands.shape[1:])), commands])
-        due = self._due([padded[late - k : len(padded) - k] for k in range(late + 1)], 1)[..., 0, :]
+        due = self._due([padded[late - k : len(padded) - k] for k in range(late + 1)], parts)
         reached = np.zeros_like(commands[0])
         for t in range(len(due)) if np.any(self.lag) else ():
-            due[t], reached = self._followed(reached, due[t], 1)
-        return np.moveaxis(due, 0, -2)
+            for k in range(parts):
+                due[t, ..., k, :], reached = self._followed(reached, due[t, ..., k, :], parts)
+        return np.moveaxis(due[..., 0, :] if parts == 1 else due, 0, inputs.ndim - 2)
 
     def _due(self, commands: list[Array], parts: int) -> Array:
         """Return the means ``(..., parts, m)`` over parts of a step of commands, the latest first, that are delayed."""

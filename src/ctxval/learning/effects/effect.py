@@ -69,6 +69,19 @@ class Effect(ShortRepr):
         """
         return u, memory
 
+    def acting(self, inputs: Array) -> Array:
+        """Return the inputs that act in each step, for commanded ones ``(..., H, m)``."""
+        commands = np.moveaxis(inputs, -2, 0)
+        if self.remembers:
+            memory, steps = np.zeros((*commands.shape[1:-1], self.remembered(inputs.shape[-1]))), []
+            for u in commands:
+                acting, memory = self.act(u, memory)
+                steps.append(acting)
+            together = np.stack(steps)
+        else:
+            together = self.act(commands, np.empty((*commands.shape[:-1], 0)))[0]
+        return np.moveaxis(together, 0, inputs.ndim - 2)
+
     def model(self, model: Model) -> Model:
         """Return the model of the mechanics. If it differs in its draws, sizes are numbers here."""
         return model
@@ -188,7 +201,8 @@ class OfInput(Effect):
     @classmethod
     def of_input(cls, k: int, most: float, observed: Observed) -> EffectCandidate:
         """Return the candidate of an input, whose largest magnitude is given."""
-        raise NotImplementedError
+        size = Parameter(cls.name, 0.0, most, 0.02 * most, observed.plant.inputs[k][1])
+        return of_size(cls((0.0,), k), size, *(share * most for share in (0.01, 0.05, 0.15)))
 
     def remembered(self, inputs: int) -> int:
         return int(self.holds)

@@ -50,6 +50,9 @@ class Late(Effect):
     def act(self, u: Array, memory: Array) -> tuple[Array, Array]:
         return self.actuator.follow(u, memory, 1 if self.held else PARTS)
 
+    def acting(self, inputs: Array) -> Array:
+        return self.actuator.acting(inputs, 1 if self.held else PARTS)
+
 
 @dataclass(frozen=True)
 class Delay(Late):
