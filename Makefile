@@ -188,4 +188,4 @@ clean:
 	touch $@
 
 reproduce: .venv/.test  ## the paper's experiments in full; writes docs/reproduction.md, and resumes
-	$(BIN)/ctxval reproduce all --out docs/reproduction --results benchmarks/results/reproduce
+	$(BIN)/python benchmarks/reproduce_paper.py all --results benchmarks/results/reproduce

@@ -33,7 +33,6 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
-from ctxval._util.json_lines import JsonLines  # noqa: E402
 from hostile import (  # noqa: E402
     archives,
     arguments,
@@ -50,6 +49,7 @@ from hostile import (  # noqa: E402
 )
 from hostile.cage import SENTINEL, STATUSES, Case, Outcome, Watched, carry_out, declared  # noqa: E402
 from hostile.values import Rng, pick  # noqa: E402
+from json_lines import JsonLines  # noqa: E402
 
 RESULTS = ROOT / "benchmarks" / "results" / "attack.jsonl"
 KEY = ("family",)
@@ -414,7 +414,6 @@ def _warm() -> None:
     import rosbags.typesys
 
     import ctxval.campaign.plot
-    import ctxval.paper.reproduce
     from ctxval.cli.commands import MODULES
 
     for module in MODULES.values():

@@ -30,11 +30,10 @@ from ctxval import (
     searches,
     systems,
 )
-from ctxval._util.json_lines import JsonLines
 from ctxval.campaign import workers
 from ctxval.campaign.goals_of_model import GoalWarning
 from ctxval.paper.cases import arm
-from ctxval.studies.fitting import Excitation
+from json_lines import JsonLines
 
 EXECUTIONS, ROUNDS, SUBSTEPS, DT = 256, 3, 5, 0.05
 LEAST = 1.5
@@ -60,13 +59,6 @@ def search(validation: Validation, store: Path) -> Campaign:
 
 def audit(validation: Validation, store: Path) -> Campaign:
     return Campaign(validation, search=searches.Random(), store=store).audit(EXECUTIONS)
-
-
-def collect(validation: Validation, folder: Path) -> None:
-    folder.mkdir()
-    for number, run in Excitation(validation, "multisine", 0.1, 5).runs(range(EXECUTIONS)):
-        assert isinstance(run, Trajectory)
-        run.to_csv(folder / f"run{number:04d}.csv")
 
 
 @contextmanager
@@ -111,7 +103,7 @@ def main() -> None:
             )
             executed = Trajectory(times[0], states, inputs)
             bare = statistics.median(bare_seconds(xml, substeps, executed) for _ in range(ROUNDS))
-        for job in (search, audit, collect):
+        for job in (search, audit):
             measured = measure(job, validation, bare)
             print(
                 f"{name}, {job.__name__} of {EXECUTIONS}: {measured['ms']:.2f} ms of CPU time each, one by one "

@@ -141,18 +141,15 @@ def main() -> None:
             program, found["install"] = installed(folder)
         for kind in ("mcap", "mat", "lerobot"):
             command = [*program, "replay", kind, "--model", "model.npz", *arguments(folder, kind)]
-            printed, times = timed([*command, "--html", f"{kind}.html", "--json"], folder)
+            printed, times = timed([*command, "--json"], folder)
             report = json.loads(printed)
             data = report["data"]
             found[kind] = {**times, "recordings": data["recordings"], "steps": data["steps"]}
             error = max(one["relative"] for one in report["errors"] if one["steps"] == 1)
-            size = (folder / f"{kind}.html").stat().st_size
             print(
                 f"{kind}: {data['recordings']} recordings, {data['steps']} steps, {times['cpu']} s of processor time,"
             )
-            print(
-                f"  {times['wall']} s in all; one-step error at most {100 * error:.2g} %, page of {size / 1000:.0f} kB"
-            )
+            print(f"  {times['wall']} s in all; one-step error at most {100 * error:.2g} %")
         if "install" in found:
             whole = {key: sum(one[key] for one in found.values()) for key in ("cpu", "wall")}
             print(f"install: {found['install']}; from install to three reports: {whole}")

@@ -13,7 +13,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from ctxval._util.json_lines import JsonLines
+from json_lines import JsonLines
 from landed import Ratio
 
 REPEATS = 11

@@ -27,7 +27,7 @@ from ctxval import (
     models,
     systems,
 )
-from ctxval._util.json_lines import JsonLines
+from json_lines import JsonLines
 from named_searches import search_named
 
 TRIALS = 10_000

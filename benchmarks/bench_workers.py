@@ -20,10 +20,10 @@ sys.path[:0] = [str(HERE.parent / "tests"), str(HERE)]
 
 import rig_cluster  # noqa: E402
 from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, searches  # noqa: E402
-from ctxval._util.json_lines import JsonLines  # noqa: E402
 from ctxval.campaign.workers import execute_task  # noqa: E402
 from ctxval.core.controller import Controller  # noqa: E402
 from ctxval.core.rollout import rollout  # noqa: E402
+from json_lines import JsonLines  # noqa: E402
 
 WORKERS = (2, 8)
 ROUNDS = 3

@@ -2,7 +2,7 @@
 
 ``python benchmarks/calibrate.py`` runs what is not stored yet; ``calibration_page.py`` writes ``docs/calibration.md``.
 Each campaign is GP-UCB, as the paper has it, on a function of the unit cube; the posterior bound is drawn at a few
-sizes of its history. The paper's own systems are taken from the stored runs of ``ctxval reproduce``.
+sizes of its history. The paper's own systems are taken from the stored runs of ``make reproduce``.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from scipy.optimize import minimize
 
 from ctxval import cases
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import DistanceBound, Sample, draw_maxima
 from ctxval.errors import CertificateError
 from ctxval.gp.hyperposterior import Prior
-from ctxval.paper.reproduce.jobs import Job, Results
 from ctxval.searches import GPUCB
+from json_lines import JsonLines
+from reproduce.jobs import Job, Results
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -157,7 +157,7 @@ def maximum(values: Values, d: int) -> float:
 
 @dataclass(frozen=True)
 class System:
-    """A case whose campaigns ``ctxval reproduce`` has stored.
+    """A case whose campaigns ``make reproduce`` has stored.
 
     Attributes:
         case, options: as on the command line.

@@ -18,12 +18,12 @@ import study_auto
 from calibrate import RESULTS, all_of
 from ctxval import Campaign
 from ctxval._util.arrays import single_threaded
-from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import Certificate, CertificateOptions, Dynamics
 from dynamics_development import DEVELOPMENT, PAPER
 from dynamics_reporting import REPORTING
 from dynamics_rough import ROUGH
 from dynamics_truths import truth
+from json_lines import JsonLines
 
 RULE = 8
 """Version of the rule by which campaigns are run now: eight tests at drawn tasks come before a validation (5), and the

@@ -18,8 +18,8 @@ import numpy as np
 from calibrate import RESULTS, all_of
 from ctxval import Campaign, Validation
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.json_lines import JsonLines
 from ctxval.core.quantiles import LEVELS
+from json_lines import JsonLines
 from noise_development import PLANTS as DEVELOPMENT
 from noise_misleading import PLANTS as MISLEADING
 from noise_reporting import PLANTS as REPORTING

@@ -16,7 +16,7 @@ import numpy as np
 from calibrate import RESULTS, all_of
 from ctxval import Campaign, Parameters, Task, Validation, controllers, systems
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.json_lines import JsonLines
+from json_lines import JsonLines
 from noise_development import PLANTS as DEVELOPMENT
 from noise_reporting import PLANTS as REPORTING
 from noise_systems import Plant, near_best, outcome, random_and_corners

@@ -15,9 +15,9 @@ from typing import Any
 from calibrate import RESULTS, all_of
 from ctxval import Campaign
 from ctxval._util.arrays import single_threaded
-from ctxval._util.json_lines import JsonLines
 from ctxval.certificates.sentences.verdicts import tolerances
 from dynamics_truths import digest
+from json_lines import JsonLines
 from strangers_development import DEVELOPMENT
 from strangers_diagnostics import JudgedRun
 from strangers_reporting import REPORTING

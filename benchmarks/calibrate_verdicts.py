@@ -19,11 +19,11 @@ from calibrate import FAMILIES, REPRODUCED, RESULTS, SYSTEMS, Values, all_of, ma
 from calibration_functions import DEVELOPMENT, REPORTING, generator
 from ctxval import Campaign, Trial, cases
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import RESOLUTION, CertificateOptions, DistanceBound, StoppingRule, covering
 from ctxval.certificates.verdict import counterexample
-from ctxval.paper.reproduce.jobs import Job, Results
+from json_lines import JsonLines
 from named_searches import search_named
+from reproduce.jobs import Job, Results
 
 RULE = 2
 """Of coverage, by which campaigns are run now."""

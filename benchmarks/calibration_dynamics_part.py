@@ -12,7 +12,7 @@ import study_posterior_ranks
 import study_time_varying
 from calibrate_dynamics import BUDGETS, FALSE, GROUPS, RULE, STORED, TRUE, WITH_TESTS
 from calibration_verdicts_part import false_of
-from ctxval._util.json_lines import JsonLines
+from json_lines import JsonLines
 from page_tables import Table, table
 
 TEXT = """## Verdicts by learned dynamics

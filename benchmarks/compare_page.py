@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctxval.paper.reproduce.jobs import AUTO, measured_with
 from page_tables import GeneratedPage, reflowed, table
+from reproduce.jobs import AUTO, measured_with
 from study_compare import BUDGETS, CONFIDENCE, PAPER, PLAIN, STORED
 
 TEXT = """# Comparisons: executions and false decisions

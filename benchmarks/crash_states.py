@@ -30,9 +30,9 @@ from crash.campaigns import BUDGET, SCRIPTS, STORE, campaign, content, digest, r
 from crash.disk import Disk, Files, Mode  # noqa: E402
 from crash.recorder import Event, record  # noqa: E402
 from ctxval import Store  # noqa: E402
-from ctxval._util.json_lines import JsonLines  # noqa: E402
 from ctxval.core.trial import Trial  # noqa: E402
 from ctxval.errors import CtxvalError  # noqa: E402
+from json_lines import JsonLines  # noqa: E402
 
 STORED = JsonLines(ROOT / "benchmarks" / "results" / "crash_states.jsonl", ("synchronous", "mode"))
 MODES: tuple[Mode, ...] = ("ordered", "strict")

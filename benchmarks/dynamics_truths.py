@@ -21,11 +21,11 @@ from ctxval import Experiment, Validation
 from ctxval._util.arrays import Array
 from ctxval._util.boxes import climb, separated_rows
 from ctxval._util.code_digest import source_digest
-from ctxval._util.json_lines import JsonLines
 from dynamics_development import DEVELOPMENT
 from dynamics_reporting import REPORTING
 from dynamics_rough import ROUGH
 from dynamics_systems import Entry, realisations
+from json_lines import JsonLines
 from study_auto import RESULTS
 
 TRUTHS = JsonLines(RESULTS / "dynamics_truths.jsonl", ("entry", "seed", "digest"))

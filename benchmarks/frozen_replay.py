@@ -26,10 +26,10 @@ import numpy as np
 from calibrate import all_of
 from ctxval import Campaign, Trajectory
 from ctxval._util.arrays import single_threaded
-from ctxval._util.json_lines import JsonLines
 from ctxval.campaign.storage.store import Store
 from ctxval.core.trial import Trial
 from freeze import ENDING, FROZEN, call, outcome, read, search_of, validation_of
+from json_lines import JsonLines
 
 CLOSE = 1e-6
 """Relative difference of numbers, and difference of tasks in the unit cube, that is none."""

@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ctxval._util.json_lines import JsonLines
+from json_lines import JsonLines
 
 LANDED = "85e23b1"
 """The revision before `auto` was made faster."""

@@ -32,9 +32,9 @@ from ctxval import (
     systems,
 )
 from ctxval._util.arrays import Array
-from ctxval._util.json_lines import JsonLines
 from ctxval.core.controller import Controller
 from ctxval.systems.functions import Derivative
+from json_lines import JsonLines
 from study_auto import Result, add_options, campaign, print_table, search_named, stored
 
 HORIZON, DT = 60, 0.05

@@ -38,8 +38,8 @@ import rig_command  # noqa: E402
 import study_evidence  # noqa: E402
 from conftest import make_validation  # noqa: E402
 from ctxval import Campaign, Store, searches  # noqa: E402
-from ctxval._util.json_lines import JsonLines  # noqa: E402
 from ctxval.campaign.storage.recovery import recover  # noqa: E402
+from json_lines import JsonLines  # noqa: E402
 from page_tables import GeneratedPage, reflowed, table  # noqa: E402
 from rig_workers import campaign as logged  # noqa: E402
 

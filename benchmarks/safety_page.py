@@ -16,14 +16,9 @@ from study_safety import (
     ASKED,
     ASKED_SEEDS,
     BUDGET,
-    CONFIDENCE,
-    DISCARDED,
-    DRAWS,
     LINEAR,
-    REPEATS,
     STORED,
     TRUTH,
-    TUBES,
     files_of_page,
 )
 
@@ -39,8 +34,6 @@ ones; a campaign has at most {budget} executions.
 
 {outcome} {asked} The 1 % by which a bound is raised, because a search may end below a ridge, was chosen on seed 0 of
 these systems. On random linear systems, all tasks with more robustness than $d_b$ are safe in {included} of {linear}.
-Disturbance sets of {draws} draws with {confidence:g} % confidence left out more tasks than stated in at most {exceeded}
-of {repeats} sets, of which {allowed:g} are permitted. Tubes held in {held} of {tubes} linear systems.
 """
 
 
@@ -117,21 +110,9 @@ def asked() -> str:
     return f"Asked for a margin ({seeds} for each system): {'; '.join(parts)}."
 
 
-def coverage() -> str:
-    """Return the table of disturbance sets."""
-    rows = [["system", "discarded", "stated share", "median true share", f"exceeded, of {REPEATS}"]]
-    for name in SYSTEMS:
-        for discarded in DISCARDED:
-            one = STORED.get(("coverage", name, discarded, None))
-            if one is not None:
-                shares = (f"{100 * one[key]:.1f} %" for key in ("volume", "median"))
-                rows.append([name, str(discarded), *shares, str(one["exceeded"])])
-    return _table(rows)
-
-
 def section() -> str:
     """Return the measured part of the page."""
-    linear, tubes = STORED.select(part="linear"), STORED.select(part="tube")
+    linear = STORED.select(part="linear")
     text = TEXT.format(
         truth=TRUTH,
         budget=BUDGET,
@@ -139,13 +120,6 @@ def section() -> str:
         asked=asked(),
         linear=LINEAR,
         included=sum(one["included"] for one in linear),
-        draws=DRAWS,
-        confidence=100 * CONFIDENCE,
-        exceeded=max(one["exceeded"] for one in STORED.select(part="coverage")),
-        repeats=REPEATS,
-        allowed=round((1 - CONFIDENCE) * REPEATS),
-        tubes=TUBES,
-        held=sum(one["held"] for one in tubes),
     )
     return "\n\n".join(
         textwrap.fill(part, 120, break_long_words=False, break_on_hyphens=False) for part in text.split("\n\n")
@@ -195,7 +169,7 @@ def main() -> None:
     draw()
     before = PAGE.read_text().partition(MARK)[0]
     PAGE.write_text(f"{before}{MARK}\n{section()}\n")
-    print(campaigns()[0], coverage(), f"{PAGE} has been written", sep="\n\n")
+    print(campaigns()[0], f"{PAGE} has been written", sep="\n\n")
 
 
 if __name__ == "__main__":

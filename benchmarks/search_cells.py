@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ctxval._util.json_lines import JsonLines
+from json_lines import JsonLines
 from study_auto import WITHIN, Result, first_within, results_of, shown
 
 SEEDS = range(10)

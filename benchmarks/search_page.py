@@ -18,12 +18,12 @@ import search_speed_part
 import search_versions_part
 import study_global_search
 from ctxval._util.arrays import Array
-from ctxval._util.json_lines import JsonLines
-from ctxval.paper.reproduce.jobs import AUTO, measured_with
+from json_lines import JsonLines
 from landed import LANDED
 from page_tables import DOCS, GeneratedPage, Table, reflowed, table
 from peers import run
 from peers.page import first_within as within_of
+from reproduce.jobs import AUTO, measured_with
 from search_ablations_part import ABLATION_SEEDS
 from search_cells import ENDS, SEEDS, Counts, cells, largest, reached, results, spread
 from study_auto import WITHIN, Result, first_within, results_of, shown

@@ -19,8 +19,8 @@ import numpy as np
 
 from ctxval import Validation
 from ctxval._util.arrays import Array
-from ctxval._util.json_lines import JsonLines
 from dynamics_truths import AGREEMENT, LEAST, DeepSearch, belongs, difference, digest
+from json_lines import JsonLines
 from strangers import Stranger
 from strangers_development import DEVELOPMENT
 from strangers_reporting import REPORTING

@@ -17,9 +17,9 @@ import dynamics_truths
 import misleading
 import study_auto
 from ctxval import Experiment, searches
-from ctxval._util.json_lines import JsonLines
 from ctxval.searches import BayesianOptimisation, TrustRegion
 from dynamics_development_misleading import MISLEADING
+from json_lines import JsonLines
 from plants import PLANTS
 from plants.truths import truth as plant_truth
 from study_auto import Result, add_options, campaign, print_table, results_of, search_named, stored

@@ -20,8 +20,8 @@ import numpy as np
 
 import named_searches
 from ctxval import Campaign, Experiment, Truth, Validation, cached_truth, cases, grid_truth, search_truth, searches
-from ctxval._util.json_lines import JsonLines
-from ctxval.paper.reproduce.jobs import AUTO, provenance
+from json_lines import JsonLines
+from reproduce.jobs import AUTO, provenance
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"

@@ -16,11 +16,11 @@ from calibrate import RESULTS
 from causes_robots import DEVELOPMENT, REPORTING
 from causes_systems import Fault, Robot, faults_of, foreign_of
 from ctxval import Campaign, searches
-from ctxval._util.json_lines import JsonLines
 from ctxval.errors import InputError
 from ctxval.learning import effects
 from ctxval.learning.effects import Effect
 from ctxval.studies.causes import find_causes
+from json_lines import JsonLines
 
 RULE = 5
 """The number of the rule by which causes are found and named, and of the way in which faults are simulated.

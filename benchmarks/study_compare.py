@@ -24,10 +24,10 @@ import numpy as np
 
 from ctxval import Task, TaskSpace, Validation, compare, controllers, distances, models, systems
 from ctxval._util.arrays import Array
-from ctxval._util.json_lines import JsonLines
 from ctxval.certificates.difference import PairedDifferences, mean_difference
 from ctxval.paper.cases import arm
-from ctxval.paper.reproduce.jobs import AUTO, provenance
+from json_lines import JsonLines
+from reproduce.jobs import AUTO, provenance
 
 STORED = JsonLines(Path(__file__).parent / "results" / "compare.jsonl", ("case", "question", "seed"))
 

@@ -24,10 +24,10 @@ from calibrate_strangers import BUDGET
 from ctxval import Campaign
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.boxes import latin_hypercube
-from ctxval._util.json_lines import JsonLines
 from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.prediction_tests import TESTS
 from dynamics_truths import digest
+from json_lines import JsonLines
 from strangers import Stranger
 from strangers_development import DEVELOPMENT
 from strangers_diagnostics import JudgedRun

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from ctxval import Campaign, Validation
-from ctxval._util.json_lines import JsonLines
 from ctxval.core.quantiles import QUANTILE
 from dynamics_reporting import REPORTING as DYNAMICS
+from json_lines import JsonLines
 from noise_reporting import PLANTS
 from page_tables import GeneratedPage, reflowed, table
 from strangers_reporting import REPORTING as STRANGERS

@@ -20,8 +20,8 @@ import study_friction
 from calibrate import RESULTS
 from ctxval import Campaign
 from ctxval._util.arrays import single_threaded
-from ctxval._util.json_lines import JsonLines
 from friction_systems import SYSTEMS as FRICTION
+from json_lines import JsonLines
 
 SYSTEMS = {**FRICTION, **notched_systems.SYSTEMS}
 STORED = JsonLines(RESULTS / "evidence.jsonl", ("group", "system", "seed", "share"))

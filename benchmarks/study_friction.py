@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from ctxval import Campaign
-from ctxval._util.json_lines import JsonLines
 from ctxval.learning.dynamics_study import DynamicsStudy
 from friction_systems import AT_REST, DEVELOPED_AT_REST, DEVELOPMENT, REGULAR, SYSTEMS
+from json_lines import JsonLines
 from page_tables import GeneratedPage, reflowed, table
 from study_auto import RESULTS
 

@@ -24,9 +24,9 @@ import misleading
 import study_auto
 from ctxval import Validation
 from ctxval._util.arrays import Array
-from ctxval._util.json_lines import JsonLines
 from ctxval.gp.ascent import Values
 from ctxval.gp.global_search import search_globally
+from json_lines import JsonLines
 
 KEY = ("case", "seed", "evaluations")
 RESULTS = study_auto.RESULTS / "global_search.jsonl"

@@ -17,11 +17,11 @@ import numpy as np
 from calibrate import RESULTS, all_of
 from ctxval import Campaign
 from ctxval._util.arrays import single_threaded
-from ctxval._util.json_lines import JsonLines
 from dynamics_development import DEVELOPMENT
 from dynamics_reporting import REPORTING
 from dynamics_truths import truth
 from hedge_systems import HEDGE
+from json_lines import JsonLines
 from named_searches import search_named
 
 BUDGET, SEEDS, WITHIN = 30, 3, 0.99

@@ -15,11 +15,11 @@ import numpy as np
 from calibrate import RESULTS, all_of
 from ctxval import Campaign
 from ctxval._util.arrays import single_threaded
-from ctxval._util.json_lines import JsonLines
 from ctxval.campaign.dynamics import NEAR
 from ctxval.errors import CertificateError
 from dynamics_reporting import REPORTING
 from dynamics_truths import truth
+from json_lines import JsonLines
 
 BUDGET, SEEDS = 12, 2
 STORED = JsonLines(RESULTS / "interval.jsonl", ("entry", "seed"))

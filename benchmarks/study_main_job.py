@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.paper.reproduce import FULL
-from ctxval.paper.reproduce.jobs import Results, measured_with
-from ctxval.paper.reproduce.pendulum import Techniques
-from ctxval.paper.reproduce.study import TECHNIQUES
 from page_tables import GeneratedPage, reflowed, table
+from reproduce import FULL
+from reproduce.jobs import Results, measured_with
+from reproduce.pendulum import Techniques
+from reproduce.study import TECHNIQUES
 
 ROOT = Path(__file__).parents[1]
 RESULTS = Results(ROOT / "benchmarks" / "results" / "reproduce")

@@ -10,11 +10,11 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from ctxval._util.json_lines import JsonLines
-from ctxval.paper.reproduce.jobs import AUTO, provenance
+from json_lines import JsonLines
 from named_searches import search_named
 from plants import PLANTS
 from plants.truths import TRUTHS, require_known, truth
+from reproduce.jobs import AUTO, provenance
 from study_auto import RESULTS, Result, campaign, print_table
 
 VERSIONS = ("before", "after")

@@ -28,13 +28,13 @@ from scipy.linalg import solve_triangular
 
 from ctxval import Task, TaskSpace, Trajectory, Transitions, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
-from ctxval._util.json_lines import JsonLines
 from ctxval.core.model import Step
 from ctxval.core.rollout import rollout
 from ctxval.learning.closed_loops import LoopPlanner, loop_pairs
 from ctxval.learning.dynamics_posterior import PosteriorSettings, learn_posterior
 from ctxval.learning.hyperparameters import ResidualHyperparameters, draw_prior
 from ctxval.models.increments import standard_deviations
+from json_lines import JsonLines
 
 KEY = ("design", "states", "seed")
 STORED = Path(__file__).parent / "results" / "posterior_ranks.jsonl"

@@ -23,10 +23,10 @@ from calibrate import RESULTS, all_of
 from calibrate_strangers import BUDGET
 from ctxval import Campaign
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.json_lines import JsonLines
 from ctxval.core.coverage import StateInputCoverage
 from ctxval.learning import LearnedDynamics
 from ctxval.learning.tolerance import pushed
+from json_lines import JsonLines
 from strangers_development import DEVELOPMENT
 from study_drawn_tests import truth
 

@@ -20,12 +20,12 @@ import numpy as np
 
 from ctxval import Campaign, Trajectory, Validation, cases, grid_truth, models, refine, search_truth, searches, systems
 from ctxval._util.arrays import Array
-from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.paper.cases import pendulum
-from ctxval.paper.reproduce.jobs import AUTO, measured_with, provenance
 from ctxval.studies.refinement import Method, ParameterFit, Records
+from json_lines import JsonLines
 from page_tables import GeneratedPage, reflowed, table
+from reproduce.jobs import AUTO, measured_with, provenance
 
 ROOT = Path(__file__).parents[1]
 STORED = JsonLines(ROOT / "benchmarks" / "results" / "refine.jsonl", ("case", "seed", "data", "method"))

@@ -13,9 +13,9 @@ import numpy as np
 
 from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, searches, systems
 from ctxval._util.arrays import Array
-from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import Audit, Sample
 from ctxval.certificates.verdict import judge_by
+from json_lines import JsonLines
 
 STORED = JsonLines(Path(__file__).parent / "results" / "retrain.jsonl", ("second_audit",))
 

@@ -1,4 +1,4 @@
-"""Which environments are safe: what campaigns certify beside the truth, and how often disturbance sets hold.
+"""Which environments are safe: what campaigns certify beside the truth.
 
 ``python benchmarks/study_safety.py`` writes ``benchmarks/results/safety.jsonl``, and resumes.
 ``benchmarks/safety_page.py`` writes the figures into ``docs/how-to/safety.md``.
@@ -14,14 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from ctxval import Array, Campaign, Task, TaskSpace, Trajectory, Validation, controllers, models, systems
-from ctxval._util.json_lines import JsonLines
+from ctxval import Array, Campaign, Task, TaskSpace, Validation, controllers, models, systems
 from ctxval.certificates import CertificateOptions, Dynamics
 from ctxval.cli.config.settings import read_settings
 from ctxval.distances import MaximumDeviation, UnsafeMargin
-from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.specs import Ball, Box, Outside, ReachAvoid
-from ctxval.studies.safety import assess, disturbance_set, draw_tasks, largest_residuals, tube_of
+from ctxval.studies.safety import assess, draw_tasks
+from json_lines import JsonLines
 from safety_systems import SYSTEMS, WALL_D_A, WALL_D_B
 
 STORED = JsonLines(Path(__file__).parent / "results" / "safety.jsonl", ("part", "case", "seed", "asked"))
@@ -31,9 +30,7 @@ ASKED = (0.7, 1.3)
 """Margins that are asked for, as shares of the true d_b."""
 TRUTH = 200_000  # tasks that the truth is of
 LINEAR = 200  # random linear systems
-DRAWS, DISCARDED, REPEATS, POOL = 40, (0, 2), 500, 20_000
 CONFIDENCE = 0.95
-TUBES = 100
 
 
 def robustness(validation: Validation, points: Array) -> tuple[Array, Array, Array]:
@@ -136,77 +133,6 @@ def linear(seed: int) -> dict[str, Any]:
     }
 
 
-def coverage(name: str, discarded: int) -> dict[str, Any]:
-    """Return how often more tasks than stated have a step outside of W, of many sets from draws of one pool."""
-    validation = SYSTEMS[name](None)
-    planner, rng = LoopPlanner(validation), np.random.default_rng(7)
-    runs = []
-    for one in planner.plan(rng.random((POOL, validation.space.dimension))):
-        together = validation.system.execute(one.controller, one.task)
-        runs += [together[k] for k in range(len(one.rows))]
-    residuals = largest_residuals(validation.model, runs)
-    scales = np.maximum(residuals[:100].max(axis=0), 1e-9)  # of tasks that are not drawn again
-    outside, volume = [], 0.0
-    for _ in range(REPEATS):
-        rows = 100 + rng.choice(POOL - 100, DRAWS, replace=False)
-        found = disturbance_set(
-            [runs[row] for row in rows], model=validation.model, scales=scales, discarded=discarded,
-            confidence=CONFIDENCE,
-        )  # fmt: skip
-        volume = found.volume
-        outside.append(float((residuals[100:] > found.half_widths * (1 + 1e-12)).any(axis=1).mean()))
-    return {
-        "draws": DRAWS,
-        "volume": volume,
-        "repeats": REPEATS,
-        "exceeded": int(sum(share > volume for share in outside)),
-        "median": float(np.median(outside)),
-    }
-
-
-def tubes(seed: int) -> dict[str, Any]:
-    """Return how near the worst disturbed loop comes to the tube of a random linear system, where d(p) is exact."""
-    rng = np.random.default_rng(seed)
-    n, H = int(rng.integers(2, 5)), 30
-    A, B, w = np.eye(n) + 0.1 * rng.normal(size=(n, n)), 0.2 * rng.normal(size=(n, n)), rng.uniform(0.001, 0.02, n)
-    model = models.Linear(A, B)
-    validation = Validation(
-        space=TaskSpace(goal=(0.5, 1.5)),
-        task=lambda p: Task(np.zeros(n), goal=[p.goal, *[0.0] * (n - 1)], horizon=H, dt=0.1),
-        system=systems.Simulated(model),
-        model=model,
-        synthesizer=controllers.LQR(np.ones(n), np.ones(n)),
-        distance=MaximumDeviation(),
-    )
-    plan = validation.plan([1.0])
-    # One draw of a task in which every step has the largest disturbance makes W the box itself.
-    found = tube_of(validation, plan, _box(w))
-    shares = []
-    for state in range(n):
-        row, signs = np.eye(n)[state], np.zeros((H, n))
-        for t in reversed(range(H)):
-            signs[t], row = np.sign(row), row @ found.loops[t]
-        shares.append(_deviation(plan, model, signs * w)[-1][state] / found.states[-1, state])
-    random = [np.abs(_deviation(plan, model, rng.uniform(-1, 1, (H, n)) * w)) for _ in range(200)]
-    held = all((moved <= found.states + 1e-12).all() for moved in random)
-    inside = float(np.max([(moved[1:] / found.states[1:]).max() for moved in random]))
-    return {"least": float(min(shares)), "most": float(max(shares)), "held": bool(held), "random": inside}
-
-
-def _box(w: Array) -> Any:
-    model = models.Linear(np.eye(len(w)), np.eye(len(w)))
-    run = Trajectory(np.array([0.0, 0.1]), np.stack([np.zeros(len(w)), w]), np.zeros((1, len(w))))
-    return disturbance_set([run], model=model, scales=w)
-
-
-def _deviation(plan: Any, model: models.Linear, disturbances: Array) -> Array:
-    x, states = plan.task.initial_state, [plan.task.initial_state]
-    for t, w in enumerate(disturbances):
-        x = model.step(x, plan.controller(t, x)) + w
-        states.append(x)
-    return np.array(states) - plan.model_trajectory.states
-
-
 def files_of_page() -> dict[str, str]:
     """Return the files of ``docs/how-to/safety.md``, by name."""
     text = (Path(__file__).parents[1] / "docs" / "how-to" / "safety.md").read_text()
@@ -249,12 +175,8 @@ def main() -> None:
     store("picture", "robot", 0, None, picture)
     for seed in range(LINEAR):
         store("linear", "random", seed, None, lambda seed=seed: linear(seed))
-    for seed in range(TUBES):
-        store("tube", "random", seed, None, lambda seed=seed: tubes(seed))
     for name in arguments.only:
         store("truth", name, 0, None, lambda name=name: truth(name))
-        for discarded in DISCARDED:
-            store("coverage", name, discarded, None, lambda name=name, k=discarded: coverage(name, k))
     for seed in range(SEEDS):
         for name in arguments.only:
             store("campaign", name, seed, None, lambda name=name, seed=seed: campaign(name, seed, None))

@@ -18,9 +18,9 @@ import numpy as np
 
 from ctxval import Validation, searches
 from ctxval._util.arrays import Array
-from ctxval._util.json_lines import JsonLines
 from ctxval.distances import ComposedDistance
 from ctxval.learning.prediction import predict_composed
+from json_lines import JsonLines
 from named_searches import search_named
 from study_auto import Result, add_options, experiment, first_within, print_rows, stored, truth
 

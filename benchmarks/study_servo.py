@@ -21,9 +21,9 @@ import numpy as np
 from calibrate import RESULTS, all_of
 from ctxval import Campaign, Task, TaskSuite, Trajectory, Validation, refine, searches
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import CertificateOptions, WholeSuite
 from ctxval.core.model import Model
+from json_lines import JsonLines
 
 SERVO = Path(__file__).parents[1] / "examples" / "servo"
 sys.path.insert(0, str(SERVO))

@@ -17,10 +17,10 @@ import numpy as np
 from calibrate import RESULTS, all_of
 from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import CertificateOptions, Dynamics
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
+from json_lines import JsonLines
 
 STEPS, DT = 30, 0.1
 BUDGET, TRUTH_TASKS = 12, 4000

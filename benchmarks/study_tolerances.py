@@ -19,9 +19,9 @@ from calibrate import RESULTS, all_of
 from calibrate_strangers import BUDGET
 from ctxval import Campaign
 from ctxval._util.arrays import single_threaded
-from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import Automatic, CertificateOptions
 from ctxval.core.learned_numbers import PushedDistances
+from json_lines import JsonLines
 from strangers_development import DEVELOPMENT
 from study_drawn_tests import truth
 

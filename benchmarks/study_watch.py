@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from ctxval import Campaign
-from ctxval._util.json_lines import JsonLines
 from ctxval.campaign.watching import Watch
+from json_lines import JsonLines
 from watch_systems import DEVELOPMENT, REPORTING, Watched
 
 STORED = JsonLines(Path(__file__).parent / "results" / "watch.jsonl", ("system", "imperfection", "part"))

@@ -38,7 +38,6 @@ from ctxval import (
     systems,
 )
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.json_lines import JsonLines
 from ctxval.campaign.choices import Choice, Execution
 from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.interval_search import IntervalSearch
@@ -47,8 +46,9 @@ from ctxval.certificates import CertificateOptions
 from ctxval.core.plan import Plan
 from ctxval.core.trial import Trial
 from ctxval.paper.cases.linear import Feedback, LinearSystem, Settings, draw
-from ctxval.paper.reproduce.jobs import AUTO, provenance
 from dynamics_systems import PartlySeen, RandomFunction
+from json_lines import JsonLines
+from reproduce.jobs import AUTO, provenance
 from study_auto import ROOT, results_of
 from study_auto import experiment as of_search_study
 from study_auto import truth as truth_of_search_study

@@ -8,7 +8,7 @@ import os
 import shutil
 import signal
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,6 @@ from ctxval.certificates import (
     StateInputCoverage,
     StateInputGap,
 )
-from ctxval.certificates.evidence import Predicted
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
 from ctxval.paper.cases import pendulum
@@ -165,14 +164,9 @@ def make_validation_without_inputs(batched: bool = True) -> Validation:
     )
 
 
-def learned_by(
-    function: Callable[[np.ndarray], np.ndarray], draws: np.ndarray, before: int = 0, count: int = 1000
-) -> Learned:
-    """Return what a prediction that is a function of points says of independent draws ``(n, d)`` and further tasks.
-
-    Its evidence opens no check, with 2000 draws of d* between 2 and 3.
-    """
-    rng, d = np.random.default_rng(4), draws.shape[1]
+def evidence_on(d: int) -> Learned:
+    """Return evidence on tasks of d parameters that opens no check, with 2000 draws of d* between 2 and 3."""
+    rng = np.random.default_rng(4)
     gap = StateInputGap(0.01, ("x[0]",), {"x[0]": 0.0})
     covered = StateInputCoverage(gap, gap, gap, {"x[0]": 0.1}, rng.random(d), 99)
     tasks = [(k / 9,) * d for k in range(1, 9)]
@@ -181,8 +175,7 @@ def learned_by(
     )
     drawn, local_maxima = rng.random((2000, d)), rng.random((3, d))
     evidence = Evidence(np.linspace(2, 3, 2000), drawn, 1.9, local_maxima, 999, 5, 0.0, 0.0, checked, covered)
-    further = np.random.default_rng([before, 9]).random((count, d))
-    return Learned(evidence, predicted=Predicted(before, function(draws), function(further)))
+    return Learned(evidence)
 
 
 def interrupt_at_once() -> None:

@@ -12,7 +12,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
-from conftest import learned_by, make_validation
+from conftest import evidence_on, make_validation
 from ctxval import Campaign, refine, searches, systems
 from ctxval.campaign.dynamics import PREDICTION
 from ctxval.certificates import (
@@ -22,7 +22,6 @@ from ctxval.certificates import (
     CheckedPrediction,
     DistanceBound,
     Evidence,
-    Region,
     Sample,
     StateInputCoverage,
     StateInputGap,
@@ -41,7 +40,7 @@ from ctxval.studies.causes import find_causes
 from ctxval.studies.fitting import FittedParameter, fit
 from ctxval.studies.refinement import HeldOut, measure_residual
 from ctxval.studies.replay import PredictedTask, PredictedTasks, Suggestion, replay
-from ctxval.studies.safety import Disturbance, DrawnTasks, SafetyReport, UnsafeTask
+from ctxval.studies.safety import DrawnTasks, SafetyReport, UnsafeTask
 from ctxval.testing import check_search
 from page_blocks import WRITTEN
 from rig_logs import run
@@ -112,13 +111,11 @@ def evidence() -> Evidence:
 def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
     points = np.linspace(0.05, 0.95, 8)[:, None]
     origins: list[Origin] = ["iid"] * 4 + ["acquisition"] * 4
-    learned = learned_by(lambda p: p[:, 0], points[:4])
-    sample = Sample(points, np.sin(5 * points[:, 0]) + 2, origins, ["completed"] * 8, learned=learned)
+    sample = Sample(points, np.sin(5 * points[:, 0]) + 2, origins, ["completed"] * 8, learned=evidence_on(1))
     certificates = [
         Audit().certify(sample),
         AnytimeAudit().certify(replace(sample, threshold=3.0)),
         certify_dynamics(sample, evidence()),
-        Region().certify(replace(sample, threshold=3.0)),
         WholeSuite().certify(replace(sample, suite=points)),
         DistanceBound().certify_drawn(sample, draw_maxima(sample, draws=4, paths=2), 0.5),
     ]
@@ -171,7 +168,7 @@ def test_the_glossary_explains_what_a_watch_says() -> None:
 
 
 def test_the_glossary_explains_what_is_said_of_safety() -> None:
-    said = {field.name for of in (SafetyReport, UnsafeTask, DrawnTasks, Disturbance) for field in fields(of)}
+    said = {field.name for of in (SafetyReport, UnsafeTask, DrawnTasks) for field in fields(of)}
     explained = words()
     assert (said | {"avoid", "reach", "drawn", "store"}) - {"tightened"} <= set(explained)
 

@@ -19,6 +19,7 @@ import typer
 
 from ctxval.cli import app
 from ctxval.cli.config.settings import ExperimentSettings
+from ctxval.controllers import PolicyContract
 from ctxval.data import LogMapping
 from page_blocks import DOCS, blocks, python_files
 from page_blocks import PAGES as EVERY_PAGE
@@ -29,7 +30,7 @@ PAGES = [*HOW_TO, *sorted(DOCS.glob("tutorials/*.md")), *sorted(DOCS.glob("expla
 PAGES += sorted(DOCS.glob("reference/*.md"))
 NEEDS = {"gymnasium": ["gymnasium", "mujoco"], "mujoco": ["mujoco"], "fmu": ["fmpy", "pythonfmu"], "mpc": ["casadi"]}
 NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn"], "state-space": ["control"]}
-NEEDS |= {"policy-and-mjcf": ["mujoco", "onnx"]}
+NEEDS |= {"policy-and-mjcf": ["mujoco"]}
 NEEDS |= {"gymnasium-and-network": ["gymnasium", "mujoco", "sklearn"]}
 NEEDS |= {"fit": ["mujoco", "sklearn", "onnx"]}
 NEEDS |= {"clusters": ["submitit", "ray", "distributed"]}
@@ -124,7 +125,8 @@ def test_commands_and_files_of_a_page_have_names_that_exist(page: Path) -> None:
         elif language == "toml":
             table = tomllib.loads(content)
             is_mapping = "mapping.toml" in content.partition("\n")[0] or "observer" in table
-            (LogMapping.from_table if is_mapping else ExperimentSettings.model_validate)(table)
+            reads = LogMapping.from_table if is_mapping else ExperimentSettings.model_validate
+            (PolicyContract.from_table if "network" in table else reads)(table)
 
 
 def parse_command(line: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import html.parser
 import importlib
 import inspect
 import json
@@ -49,7 +48,6 @@ from ctxval import (
     systems,
     testing,
 )
-from ctxval._util import representation
 from ctxval._util.describe import describe
 from ctxval._util.representation import WIDTHS, ShortRepr, shown
 from ctxval.certificates import Certificate, Sample
@@ -382,7 +380,6 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.Forecast": lambda: certificates.Forecast(12, 0.75, 0.25),
     "certificates.RecoveredFailure": lambda: certificates.RecoveredFailure(3, 7, "fuse replaced"),
     "certificates.Maxima": lambda: certificates.draw_maxima(sample(), draws=12, paths=4),
-    "certificates.Region": certificates.Region,
     "certificates.Sample": sample,
     "certificates.Verdict": lambda: certificates.judge(
         campaign().trials, 0.01, certificates.CertificateOptions(certificates.DistanceBound())
@@ -398,8 +395,6 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "data.Recordings": recordings,
     "data.Signal": lambda: data.Signal(np.arange(9.0), np.zeros((9, 2))),
     "data.Table": lambda: data.Table("run.csv", ("t", "x"), lambda names: dict.fromkeys(names, np.arange(9.0))),
-    "studies.fitting.Excitation": lambda: fitting.Excitation(make_validation(), "chirp", 0.5, 5.0),
-    "studies.fitting.Excited": lambda: fitting.Excited(policy, np.ones((9, 1)), controllers.Limits([-1.0], [1.0])),
     "studies.fitting.FailedFit": lambda: fitting.FailedFit("linear", "too few steps"),
     "studies.fitting.FitReport": fitted,
     "studies.fitting.FittedModel": lambda: fitted().fitted[0],
@@ -686,78 +681,6 @@ def test_what_identifies_an_object_in_a_store_does_not_depend_on_what_it_shows(m
     assert "1.00001" in before["in an array"]
 
 
-# HTML
-
-
-class _Reader(html.parser.HTMLParser):
-    """What a browser would find."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: set[str] = set()
-        self.attributes: set[str] = set()
-        self.texts: list[str] = []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.add(tag)
-        self.attributes |= {name for name, _ in attrs}
-
-    def handle_data(self, data: str) -> None:
-        self.texts.append(data)
-
-
-def test_a_trial_is_a_table_in_a_notebook() -> None:
-    texts = _Reader(FAILED._repr_html_()).texts
-    cells = dict(zip(texts[1::2], texts[2::2], strict=True))
-    assert texts[0] == "Trial 3"
-    assert cells == {
-        "origin": "initial",
-        "state": "failed",
-        "failure": "motor stalled",
-        "attempts": "2",
-        "goal": "0.25",
-    }
-
-
-def test_a_certificate_is_a_table_with_its_bound_rounded_up_and_all_it_assumes() -> None:
-    texts = _Reader(CERTIFICATE._repr_html_()).texts
-    assert texts[:3] == ["Certificate: audit", "statement", CERTIFICATE.statement]
-    assert texts[3:7] == ["upper bound", "0.3001", "confidence", "0.95"]
-    assert [texts[i + 1] for i, text in enumerate(texts) if text == "assumes"] == ["a", "b"]
-
-
-def test_a_campaign_is_a_table_with_its_worst_task() -> None:
-    worst = campaign().worst
-    assert worst is not None
-    texts = _Reader(campaign()._repr_html_()).texts
-    cells = dict(zip(texts[1::2], texts[2::2], strict=True))
-    assert texts[0] == "Campaign pendulum"
-    assert cells["worst trial"] == str(worst.number)
-    assert cells["distance"] == f"{worst.distance:.4g}"
-    assert cells["goal"] == f"{_goal(worst):.4g} rad"
-
-
-@pytest.mark.parametrize("name", ["trial", "certificate", "campaign"])
-def test_hostile_content_is_escaped_in_a_notebook(name: str) -> None:
-    text = ATTACKS[name]()._repr_html_()  # type: ignore[attr-defined]
-    read = _Reader(text)
-    assert read.tags == {"table", "caption", "tbody", "tr", "th", "td"}
-    assert read.attributes == {"style", "scope"}
-    assert text.isprintable()
-    assert_names(text, 1)
-    assert len(text) < 100_000
-
-
-def test_a_table_sets_no_colours() -> None:
-    text = representation.table("a", [("b", 1)])
-    assert "#" not in text
-    assert "rgb" not in text
-    assert "background:transparent" in text
-    assert "color:inherit" in text
-
-
 # Tables of pandas
 
 
@@ -805,7 +728,7 @@ def test_showing_objects_loads_neither_pandas_nor_matplotlib() -> None:
     code = (
         "import sys, ctxval; from ctxval import cases; "
         "campaign = ctxval.Campaign(cases.by_name('pendulum').validation); "
-        "repr(campaign), campaign._repr_html_(); print({'pandas', 'matplotlib'} & set(sys.modules))"
+        "repr(campaign); print({'pandas', 'matplotlib'} & set(sys.modules))"
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.strip() == "set()"

@@ -63,7 +63,6 @@ _COMMANDS: dict[str, tuple[str, ...]] = {
     "check": ("--json",),
     "init": ("--json",),
     "cases": ("--json",),
-    "reproduce": ("--quick", "--out"),
 }
 _FLAGS = ("--explore", "--truth", "--json", "--draw", "--resample", "--quick")
 _PLACES = (
@@ -102,8 +101,6 @@ def command_line(rng: Rng) -> tuple[str, ...]:
 
 
 def _place(rng: Rng, name: str) -> str:
-    if name == "reproduce":
-        return text(rng, 100)  # those that are known take hours
     return str(pick(rng, _PLACES)) if rng.random() < 0.8 else text(rng, 5_000)
 
 

@@ -50,7 +50,7 @@ def outputs(rng: Rng, folder: Path, base: Path) -> Case:
     lines: tuple[tuple[str, ...], ...] = (
         ("fit", *logs, *mapped, "--kind", "linear", "--out", model),
         ("fit", *logs, *mapped, "--kind", "linear", "--out", model),
-        ("replay", "run0.csv", "--model", "model.npz", *mapped, "--html", html),
+        ("replay", "run0.csv", "--model", "model.npz", *mapped),
         ("report", stores.NAME, "--out", html),
         ("report", stores.NAME, "--out", "r.html", "--junit", str(pick(rng, (victim, "r.html", "link.html")))),
         ("report", stores.NAME, "--out", "r.html", "--markdown", str(pick(rng, (victim, "r.html", "new.md")))),
@@ -61,9 +61,8 @@ def outputs(rng: Rng, folder: Path, base: Path) -> Case:
         ("ask", stores.NAME, "--trial", "4"),
         ("ask", stores.NAME, "--trial", "4", "--out", str(pick(rng, ("saved", victim)))),
         ("init", str(pick(rng, ("experiment.toml", "new.toml", "mapping.toml", "saved", victim)))),
-        ("collect", "experiment.toml", "--amplitude", "1", "--runs", "1", "--out", str(pick(rng, (victim, "logs")))),
         ("run", "experiment.toml", "--search", "random", "--budget", "2", "--no-report", "--store", victim),
-        ("compare", "one=experiment.toml", "two=pendulum", "--budget", "2", "--out", victim),
+        ("compare", "one=experiment.toml", "two=pendulum", "--budget", "2", "--stores", victim),
         ("ask", "experiment.toml", "--store", victim),
         ("refine", stores.NAME, "--threshold", "0.1", "--method", "linear", "--budget", "5", "--out", model),
         ("certify", stores.NAME, "--threshold", "0.5", "--kind", "scenario"),
@@ -123,7 +122,6 @@ def secret_system(rng: Rng, folder: Path, base: Path) -> Case:
         ("certify", stores.NAME, "--threshold", "0.5", "--kind", "scenario", "--json"),
         ("certify", stores.NAME, "--audit", "1", "--kind", "scenario", *own),
         ("remeasure", stores.NAME, *own),
-        ("collect", "experiment.toml", "--amplitude", "1", "--runs", "1", "--json"),
         ("compare", "one=experiment.toml", "two=experiment.toml", "--budget", "1"),
     )
     line = pick(rng, lines)

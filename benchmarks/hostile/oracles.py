@@ -143,13 +143,11 @@ def _digest(path: str) -> tuple[object, ...]:
         return "file", status.st_mode, hashlib.blake2b(file.read()).digest()
 
 
-_OUTPUTS = ("--out", "-o", "--html", "--junit", "--markdown", "--store", "--stores", "--results")
+_OUTPUTS = ("--out", "-o", "--junit", "--markdown", "--store", "--stores", "--results")
 _DEFAULTS = {
     "init": ("*.toml", "*_system.py"),
     "run": ("runs/*", "runs"),
     "compare": ("runs/*", "runs"),
-    "collect": ("logs/*", "logs"),
-    "reproduce": ("reproduction*",),
 }
 _NEVER_MIND = ("*__pycache__*", "f/home/*", "f/PWNED", "f/elsewhere*")
 """Files of the interpreter and of libraries; the last ones are those of hostile code that may run."""

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.json_lines import JsonLines
+from json_lines import JsonLines
 from peers.functions import Function, function
 from peers.methods import METHODS
 from peers.recorder import Recorder

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.paper.reproduce.jobs import AUTO, measured_with
 from page_tables import DOCS, GeneratedPage, Table, reflowed, table
 from peers import overhead, run
 from peers.functions import CASES, SEEDS
 from peers.methods import METHODS
 from peers.overhead import COUNTS
 from peers.run import CUT, Result, applies, budget_of
+from reproduce.jobs import AUTO, measured_with
 from study_auto import shown
 
 PICTURES = DOCS / "benchmarks"

@@ -11,11 +11,11 @@ import argparse
 import functools
 from typing import Any
 
-from ctxval._util.json_lines import JsonLines
-from ctxval.paper.reproduce.jobs import AUTO, provenance
+from json_lines import JsonLines
 from peers.functions import CASES, SEEDS, Function, function
 from peers.methods import METHODS
 from peers.recorder import Finished, Maximise, Recorder
+from reproduce.jobs import AUTO, provenance
 from study_auto import RESULTS, results_of
 
 STORED = JsonLines(RESULTS / "peers.jsonl", ("case", "method", "seed"))

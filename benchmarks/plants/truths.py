@@ -9,8 +9,8 @@ import argparse
 from typing import Any
 
 from ctxval import Experiment
-from ctxval._util.json_lines import JsonLines
 from dynamics_truths import digest, known
+from json_lines import JsonLines
 from plants import PLANTS, Plant
 from study_auto import RESULTS
 

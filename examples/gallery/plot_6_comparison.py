@@ -7,7 +7,6 @@ which of them does the cart differ less from the prediction, at worst and on ave
 """
 
 import numpy as np
-from matplotlib import pyplot
 
 import ctxval
 from ctxval import Labels, Task, TaskSpace, Validation, controllers, distances, models, systems
@@ -36,12 +35,6 @@ candidates = {"gentle": cart(controllers.LQR([1, 1], [1])), "stiff": cart(contro
 result = ctxval.compare(candidates, question="both", budget=60, confidence=0.95)
 for pair in result.pairs:
     print(f"{pair.question}: {pair.reason}")
-
-# %%
-# The dots are executed distances, which are facts. The bar is the bound on d* that the decision needed: only the
-# better controller needs one. The line on the right is the confidence interval of the difference of expected distances.
-result.plot()
-pyplot.show()
 
 # %%
 # The truths are known here, because the system is a simulation.

@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from ctxval.core.truth import Truth, cached_truth, grid_truth, search_truth
     from ctxval.core.validation import Validation
     from ctxval.paper import cases as cases
-    from ctxval.paper import reproduce as reproduce
     from ctxval.studies import aspect1 as aspect1
     from ctxval.studies import comparison as comparison
     from ctxval.studies import fitting as fitting
@@ -93,7 +92,7 @@ _MODULES = {
     **{name: name for name in ("certificates", "controllers", "data", "distances", "errors", "gp", "models", "report")},
     **{name: name for name in ("searches", "specs", "systems", "testing")},
     **{name: f"studies.{name}" for name in ("aspect1", "comparison", "fitting", "refinement", "replay", "safety")},
-    **{"cases": "paper.cases", "plot": "campaign.plot", "reproduce": "paper.reproduce"},
+    **{"cases": "paper.cases", "plot": "campaign.plot"},
 }
 """The public modules, which ``import ctxval`` alone makes usable: each is imported when it is first used."""
 

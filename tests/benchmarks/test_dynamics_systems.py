@@ -14,8 +14,8 @@ from threadpoolctl import threadpool_info
 
 from ctxval import Task, grid_truth
 from ctxval._util.arrays import Array
-from ctxval._util.json_lines import JsonLines
 from facts import refuses
+from json_lines import JsonLines
 from rig_thorough import some
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"

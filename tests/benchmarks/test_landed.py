@@ -15,7 +15,7 @@ sys.path.insert(0, str(BENCHMARKS))
 
 import landed  # noqa: E402
 import search_speed_part  # noqa: E402
-from ctxval._util.json_lines import JsonLines  # noqa: E402
+from json_lines import JsonLines  # noqa: E402
 
 RATIO = landed.Ratio("bench_auto", "a suggestion", [3.0, 1.0, 2.0], [0.5, 0.25, 0.25], least=8.0)
 

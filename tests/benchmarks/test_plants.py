@@ -20,9 +20,9 @@ sys.path.insert(0, str(BENCHMARKS))
 
 import plants  # noqa: E402
 import search_plants_part  # noqa: E402
-from ctxval._util.json_lines import JsonLines  # noqa: E402
 from dynamics_systems import repeated  # noqa: E402
 from dynamics_truths import belongs, digest  # noqa: E402
+from json_lines import JsonLines  # noqa: E402
 from plants import (  # noqa: E402
     DEVELOPMENT,
     PLANTS,

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ctxval.paper.reproduce import FULL, STUDIES, parameters, table_text
-from ctxval.paper.reproduce.jobs import Results
+from reproduce import FULL, STUDIES, parameters, table_text
+from reproduce.jobs import Results
 
 RESULTS = Path("benchmarks/results/reproduce")
 """Seen from the folder of the repository, as the page names it."""

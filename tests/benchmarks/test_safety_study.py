@@ -33,13 +33,10 @@ def test_the_wall_has_its_closed_form() -> None:
     assert of_model[(of_model > 0) & (of_system <= 0)].max() == pytest.approx(WALL_D_B, abs=0.02)
 
 
-def test_a_random_system_and_a_tube_of_the_study() -> None:
+def test_a_random_system_of_the_study() -> None:
     found = study_safety.linear(3)
     assert found["ordered"]
     assert found["included"]
-    tube = study_safety.tubes(3)
-    assert tube["held"]
-    assert tube["least"] == pytest.approx(1.0)
 
 
 def test_the_page_is_that_of_the_stored_results() -> None:

@@ -14,8 +14,8 @@ sys.path.insert(0, str(BENCHMARKS))
 
 import search_page  # noqa: E402
 import search_versions_part  # noqa: E402
-from ctxval._util.json_lines import JsonLines  # noqa: E402
-from ctxval.paper.reproduce.jobs import AUTO, provenance  # noqa: E402
+from json_lines import JsonLines  # noqa: E402
+from reproduce.jobs import AUTO, provenance  # noqa: E402
 from study_auto import CASES, KEY, first_within, results_of, stored  # noqa: E402
 
 TARGETS = search_page.targets()

@@ -7,7 +7,7 @@ import pytest
 
 from conftest import make_validation
 from ctxval import Campaign, Labels, Trajectory, searches
-from ctxval.certificates import CertificateOptions, Dynamics, Region, Sample, require_learned
+from ctxval.certificates import CertificateOptions, Dynamics, Sample, require_learned
 from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy
 from facts import refuses
@@ -37,28 +37,13 @@ def test_nothing_is_predicted_without_trajectories_and_data() -> None:
     assert np.isnan(campaign.recorder.dynamics.expected(campaign.trials, POINTS, 0)).all()
 
 
-def test_further_tasks_are_independent_of_trials_and_repeat() -> None:
-    campaign = Campaign(make_validation(), search=searches.Random(), seed=3).run(2).audit(3)
-    options = CertificateOptions(Region(predictions=50))
-    found, again = (campaign.provenance_for(options).learned for _ in range(2))
-    assert found is not None
-    assert again is not None
-    assert found.predicted is not None
-    assert again.predicted is not None
-    sample = Sample.of(campaign.trials)
-    drawn = [sample.numbers[row] for row in sample.countable]
-    assert (found.predicted.before, len(found.predicted.executed)) == (drawn[0], len(drawn))
-    assert found.predicted.drawn.shape == (50,)
-    np.testing.assert_array_equal(found.predicted.drawn, again.predicted.drawn)
-
-
 def test_a_sample_keeps_the_predictions_and_a_kind_asks_for_them() -> None:
     campaign = Campaign(make_validation(), search=searches.Random(), seed=3).run(3)
     learned = campaign.provenance.learned
     sample = Sample.of(campaign.trials, learned=learned)
-    assert require_learned(sample.only("iid").rows([0, 1]), "region") is learned
-    with refuses(CertificateError, "region"):
-        require_learned(Sample.of(campaign.trials), "region")
+    assert require_learned(sample.only("iid").rows([0, 1]), "dynamics") is learned
+    with refuses(CertificateError, "dynamics"):
+        require_learned(Sample.of(campaign.trials), "dynamics")
 
 
 @pytest.mark.slow

@@ -16,7 +16,6 @@ from ctxval.certificates import (
     Audit,
     CertificateKind,
     CertificateOptions,
-    Region,
     SamplingDiscarding,
     Scenario,
 )
@@ -77,7 +76,7 @@ def drawn() -> Campaign:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [Audit(), AnytimeAudit(), Scenario(), SamplingDiscarding(2), Region()])
+@pytest.mark.parametrize("kind", [Audit(), AnytimeAudit(), Scenario(), SamplingDiscarding(2)])
 def test_every_text_says_that_a_volume_is_a_probability_under_it(kind: CertificateKind, drawn: Campaign) -> None:
     accepted = drawn.verdict(1e3, certificate=CertificateOptions(kind, volume=0.4))
     refused = drawn.verdict(1e3, certificate=CertificateOptions(kind, volume=0.01))

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from conftest import learned_by
+from conftest import evidence_on
 from ctxval import certificates
 from ctxval.certificates import (
     KINDS,
@@ -59,14 +59,13 @@ confidences = st.floats(0.01, 0.999)
 
 def sample(n: int = 9, origin: str = "acquisition") -> Sample:
     X = np.linspace(0.0, 1.0, n)[:, None]
-    learned = learned_by(lambda points: 0.9 + np.sin(4 * points[:, 0]), X)
-    return Sample(X, 1.0 + np.sin(4 * X[:, 0]), [origin] * n, ["completed"] * n, learned=learned)  # type: ignore[list-item]
+    return Sample(X, 1.0 + np.sin(4 * X[:, 0]), [origin] * n, ["completed"] * n, learned=evidence_on(1))  # type: ignore[list-item]
 
 
 # The kinds of this package
 
 
-OWN = ("anytime", "audit", "auto", "dynamics", "posterior", "region", "sampling-discarding", "scenario", "suite")
+OWN = ("anytime", "audit", "auto", "dynamics", "posterior", "sampling-discarding", "scenario", "suite")
 EVERYTHING = sample(30, origin="iid")
 SUITE = replace(EVERYTHING, suite=EVERYTHING.points)
 
@@ -128,15 +127,14 @@ def test_which_kinds_have_a_use_for_an_option_follows_from_their_fields() -> Non
     uses = {
         "tests": ("auto", "dynamics"),
         "resolution": ("auto", "posterior"),
-        "volume": ("anytime", "audit", "region", "sampling-discarding", "scenario"),
-        "discard": ("region", "sampling-discarding"),
-        "predictions": ("region",),
+        "volume": ("anytime", "audit", "sampling-discarding", "scenario"),
+        "discard": ("sampling-discarding",),
     }
     found = {option: tuple(kind for kind in OWN if option in KINDS.find(kind).options()) for option in uses}
     assert found == uses
     with refuses(UnknownNameError, "resolution", "posterior"):
         require_use("posterior", ["resolutoin"])
-    with refuses(CertificateError, "posterior", "region"):
+    with refuses(CertificateError, "posterior", "sampling-discarding"):
         require_use("posterior", ["discard"])
 
 

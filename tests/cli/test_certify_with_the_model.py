@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from ctxval import Store
 from ctxval.cli import app
 from ctxval.cli.config import trust
 from facts import assert_names
@@ -46,45 +45,8 @@ def store(stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 @pytest.mark.thorough
-def test_an_audit_for_a_region_is_drawn_and_certified_in_one_command(searched: Path, tmp_path: Path) -> None:
-    store = str(shutil.copy(searched, tmp_path / "a.sqlite"))
-    arguments = (
-        "certify",
-        store,
-        "--kind",
-        "region",
-        "--audit",
-        "30",
-        "--threshold",
-        "0.5",
-        "--volume",
-        "0.15",
-        "--json",
-    )
-    result = invoke(*arguments)
-    assert result.exit_code == 0, result.stderr
-    report = json.loads(result.stdout)
-    assert (report["verdict"], report["kind"], report["trials"]) == ("validated", "region", 30)
-    assert report["details"]["learned_before"] == 6
-    assert report["details"]["share_kept"] == 1
-    assert 0.09 < report["details"]["volume_of_draws"] < report["volume"] < 0.15
-    assert report["upper_bound"] == 0.5
-
-
-@pytest.mark.thorough
-def test_a_region_speaks_to_a_person_and_executes_nothing(store: str) -> None:
-    before = Store.existing(Path(store)).trials()
-    text = " ".join(invoke("certify", store, "--kind", "region", "--threshold", "0.38").stdout.split())
-    assert_names(text, "UNDECIDED", 0.38, "region", 30)
-    assert_names(text, "region", 95)
-    assert_names(text, 0.38)
-    assert_names(text, "trials", "before")
-    assert len(Store.existing(Path(store)).trials()) == len(before) == 36
-
-
-@pytest.mark.thorough
 def test_a_counterexample_stands_beside_the_map(store: str) -> None:
-    result = invoke("certify", store, "--kind", "region", "--threshold", "0.2", "--json")
+    result = invoke("certify", store, "--kind", "dynamics", "--threshold", "0.2", "--json")
     report = json.loads(result.stdout)
     assert result.exit_code == 1
     assert report["verdict"] == "falsified"
@@ -132,10 +94,8 @@ def test_options_are_given_by_name_and_checked(tmp_path: Path, monkeypatch: pyte
     Path("rotor.toml").write_text(FILE.replace("rotor_parts", "option_parts"))
     assert invoke(*RUN).exit_code == 0
     assert invoke("certify", "r.sqlite", "--audit", "12").exit_code == 0
-    options = ("--discard", "2", "--option", "predictions=50")
-    found = json.loads(invoke("certify", "r.sqlite", "--kind", "region", *options, "--json").stdout)
-    assert (found["details"]["discarded"], found["details"]["predictions"]) == (2, 50)
-    refused = invoke("certify", "r.sqlite", "--kind", "region", "--option", "tests=3")
+    assert invoke("certify", "r.sqlite", "--kind", "posterior", "--option", "resolution=0.3").exit_code != 2
+    refused = invoke("certify", "r.sqlite", "--kind", "audit", "--option", "tests=3")
     assert refused.exit_code == 2
     assert_names(refused.stderr, "tests", "auto", "dynamics")
 
@@ -147,14 +107,14 @@ def test_code_of_another_user_is_asked_about_first(tmp_path: Path, monkeypatch: 
     run = invoke(*RUN)
     assert run.exit_code == 0, run.output
     assert invoke("certify", "r.sqlite", "--audit", "12").exit_code == 0
-    own = invoke("certify", "r.sqlite", "--kind", "region")
+    own = invoke("certify", "r.sqlite", "--kind", "dynamics")
     assert own.exit_code == 0, own.output
     shutil.rmtree(trust.allowed_folder())  # as if another user had made the store
     assert invoke("certify", "r.sqlite", "--kind", "audit").exit_code == 0  # runs no code
-    foreign = invoke("certify", "r.sqlite", "--kind", "region")
+    foreign = invoke("certify", "r.sqlite", "--kind", "dynamics")
     assert foreign.exit_code == 2
     assert_names(foreign.stderr, "--trust")
-    named = invoke("certify", "r.sqlite", "--kind", "region", "--experiment", "rotor.toml")
+    named = invoke("certify", "r.sqlite", "--kind", "dynamics", "--experiment", "rotor.toml")
     assert named.exit_code == 0, named.output
 
 
@@ -164,21 +124,6 @@ def test_a_store_made_in_python_asks_for_its_experiment(tmp_path: Path, monkeypa
 
     monkeypatch.chdir(tmp_path)
     Campaign(make_validation(), search=searches.Random(), store="own.sqlite").run(12)
-    refused = invoke("certify", "own.sqlite", "--kind", "region")
+    refused = invoke("certify", "own.sqlite", "--kind", "dynamics")
     assert refused.exit_code == 2
     assert_names(" ".join(refused.stderr.split()), "--experiment", "FILE.toml")
-
-
-def test_what_was_planned_for_a_kind_holds_although_the_kind_is_named_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("planned_parts.py").write_text(PARTS)
-    Path("rotor.toml").write_text(
-        f'{FILE.replace("rotor_parts", "planned_parts")}[certificate]\nkind = "region"\ndiscard = 2\n'
-    )
-    assert invoke(*RUN).exit_code == 0
-    assert invoke("certify", "r.sqlite", "--audit", "12").exit_code == 0
-    for named in ((), ("--kind", "region")):
-        shown = invoke("certify", "r.sqlite", *named, "--json")
-        assert json.loads(shown.stdout)["details"]["discarded"] == 2

@@ -675,7 +675,7 @@ def test_user_code_that_leaves_python_is_not_taken_for_done(invoke) -> None:  # 
 def test_the_help_lists_the_usual_commands_in_groups_and_names_the_glossary(invoke) -> None:  # type: ignore[no-untyped-def]
     text = invoke("--help").stdout
     listed = {name for name in MODULES if re.search(rf"^│ {name} +[A-Z]", text, re.MULTILINE)}
-    assert listed == {*MODULES} - {"remeasure", "collect", "certify", "cases", "reproduce"}
+    assert listed == {*MODULES} - {"remeasure", "certify", "cases"}
     assert invoke("cases").exit_code == 0
     places = [text.index(f"─ {panel} ─") for panel in PANELS if panel != "Paper"]
     assert places == sorted(places)

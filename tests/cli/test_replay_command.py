@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
@@ -226,18 +225,3 @@ def test_names_in_a_log_steer_no_terminal(invoke: Invoke) -> None:
     Path("odd.csv").write_text("t,\x1b[31mred,u0\n0,1,2\n0.1,1,2\n0.2,1,2\n")
     result = invoke("odd.csv", "--model", "Linear", "--option", "A=[[1.0]]", "--option", "B=[[1.0]]", "--state", "\x1b")
     assert "\x1b" not in result.stdout + result.stderr
-
-
-def test_a_replay_is_also_a_page(invoke: Invoke, tmp_path: Path) -> None:
-    Path("runs").mkdir()
-    for seed in range(3):
-        run(60, seed).to_csv(f"runs/run{seed}.csv")
-    done = invoke("runs", *LINEAR, "--html", "out/page.html", "--json")
-    assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout)["report"] == "out/page.html"
-    assert Path("out/page.html").exists()
-    printed = invoke("runs", *LINEAR, "--html", "out/page.html")
-    assert "report: out/page.html" in printed.output
-    refused = invoke("runs", *LINEAR, "--html", "runs")
-    assert refused.exit_code == 2
-    assert_names(refused.output, "--html", "runs")

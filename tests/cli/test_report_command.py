@@ -122,8 +122,9 @@ def test_a_report_that_cannot_be_written_does_not_hide_the_verdict(invoke: Any) 
 
 
 def test_a_store_that_you_made_has_a_report_with_its_experiment(invoke: Any, store: Path) -> None:
-    done = invoke("report", str(store), "--junit", "a.xml", "--markdown", "a.md")
+    done = invoke("report", str(store), "--junit", "a.xml", "--markdown", "a.md", "--card", "card.md")
     assert done.exit_code == 0, done.output
+    assert json.loads(Path("card.json").read_text())["executions"] == 4
     page = Path("a.report.html").read_text(encoding="utf-8")
     assert "corrected model" in page
     assert_names(page, 4)

@@ -156,3 +156,15 @@ def test_an_environment_that_cannot_be_is_refused() -> None:
         task(initial_state=[np.zeros(2), 0], environment={"wall": [np.zeros(3)]})
     with refuses(InputError, "environment", "wall"):
         task(environment={"wall": [np.nan]})
+
+
+def test_a_command_is_an_entry_of_the_environment() -> None:
+    tasks = Task([np.zeros(3), 1.0], horizon=4, dt=0.1, command=[np.array([0.1, 0.2, 0.3]), 0.0, -1.0, 2.0])
+    assert tasks.command.shape == (3, 4)
+    assert tasks[1].command.tolist() == [0.2, 0.0, -1.0, 2.0]
+    assert Task.stacked([tasks[0], tasks[2]]).command[1, 0] == 0.3
+    assert np.array_equal(tasks.starting_at(np.ones((3, 2))).command, tasks.command)
+    with refuses(InputError, "command"):
+        _ = Task([0.0], horizon=4, dt=0.1).command
+    with refuses(InputError, "one command"):
+        Task([0.0], horizon=4, dt=0.1, command=[1.0], environment={"command": [2.0]})

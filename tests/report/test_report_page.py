@@ -17,13 +17,12 @@ import pytest
 from rig_pages import HOSTILE, hostile_store, pendulum, plane
 
 from ctxval import Campaign, Trial, report
-from ctxval.certificates import CertificateOptions, DistanceBound, Region
+from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.errors import InputError
 from ctxval.report import ReportContext, context_of_campaign, context_of_store
 from ctxval.report.sections.repeat import command_of, identity, python_snippet
 from ctxval.report.sections.trials import packed, recorded_lines
 from facts import assert_names, refuses
-from rig_thorough import more
 
 POSTERIOR = CertificateOptions(DistanceBound())
 
@@ -289,17 +288,6 @@ def test_the_snippet_executes_the_task_again(tmp_path: Path) -> None:
     names: dict[str, Any] = {"validation": campaign.validation}
     exec(code, names)
     assert names["outcome"].distance == pytest.approx(trial.distance)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dimension", [2, *more(1, 3)])
-def test_the_map_of_the_region_certificate_is_drawn(dimension: int) -> None:
-    campaign = pendulum(executions=6) if dimension == 1 else plane(dimension, 6, {})
-    campaign.audit(20)
-    options = CertificateOptions(Region(), volume=0.4)
-    found = report.page(context_of_campaign(campaign, threshold=9.0, certificate=options))
-    assert_names(found, "threshold")
-    assert not broken(found)
 
 
 @pytest.mark.thorough

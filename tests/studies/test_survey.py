@@ -14,7 +14,7 @@ from ctxval import Trajectory
 from ctxval.errors import InputError
 from ctxval.studies.survey import Survey, survey
 from facts import assert_names, refuses
-from rig_logs import run, write_bag, write_control_desk, write_lerobot, write_mat, write_mcap_ros2, write_parquet
+from rig_logs import run, write_bag, write_lerobot, write_mat, write_mcap_ros2, write_parquet
 
 RUNS = [run(60, seed) for seed in range(4)]
 
@@ -53,7 +53,6 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     ),
     "bags": lambda to: each(to / "bags", lambda path, one: write_bag(path, one), ""),
     "matlab 7.3": lambda to: each(to / "mat", lambda path, one: write_mat(path, one, version="7.3"), ".mat"),
-    "matlab of dSPACE": lambda to: each(to / "dspace", write_control_desk, ".mat"),
     "parquet": lambda to: each(to / "parquet", write_parquet, ".parquet"),
 }
 

@@ -5,6 +5,8 @@ import pytest
 
 from ctxval import Task, rollout, systems
 from ctxval._util.arrays import Array
+from ctxval._util.describe import describe
+from ctxval.cli.config.parts import part
 from ctxval.errors import InputError
 from facts import refuses
 
@@ -75,3 +77,30 @@ def test_bad_numbers_are_named() -> None:
         systems.Imperfect(step, process=[0.1, -1.0])
     with refuses(InputError, "delay", -1.0):
         systems.Imperfect(step, delay=-1.0)
+
+
+def test_weak_motors_and_a_push_change_the_loop() -> None:
+    weak = systems.Imperfect(step, vectorized=True, strength=0.5).execute(pi, TASK)
+    assert weak.states[1:] == pytest.approx(step(weak.states[:-1], 0.5 * weak.inputs))
+    pushed = systems.Imperfect(step, vectorized=True, push={"1": 0.4}, push_time=0.52).execute(pi, TASK)
+    moved = pushed.states[:-1] + np.where(np.arange(20) == 5, 0.4, 0.0)[:, None] * [0.0, 1.0]
+    assert pushed.states[1:] == pytest.approx(step(moved, pushed.inputs))
+    held = systems.Imperfect(step, vectorized=True, delay=1.0, before=0.3).execute(pi, TASK)
+    late = np.concatenate([[[0.3]], held.inputs[:-1]])
+    assert held.states[1:] == pytest.approx(step(held.states[:-1], late))
+    plain = describe(systems.Imperfect(step, vectorized=True))
+    assert {"before", "strength", "push", "push_time"} & set(plain) == set()
+    assert describe(systems.Imperfect(step, push={0: 1.0}))["push"] == {"0": 1.0}
+    with refuses(InputError, "indices"):
+        systems.Imperfect(step, push={"speed": 1.0})
+
+
+def test_a_simulator_is_a_system_with_latency() -> None:
+    pytest.importorskip("mujoco")
+    mjcf = """<mujoco><option timestep="0.01"/><worldbody><body><joint name="a" damping="0.1"/>
+    <geom size="0.1" mass="1" pos="0 0 -0.5"/></body></worldbody><actuator><motor joint="a"/></actuator></mujoco>"""
+    system = part("system", {"type": "Imperfect", "step": {"type": "MuJoCo", "mjcf": mjcf, "dt": 0.02}, "delay": 1.0})
+    task = Task([1.0, 0.0], horizon=20, dt=0.02)
+    run = system.execute(pi, task)
+    again = iter([np.zeros(1), *run.inputs])
+    assert systems.MuJoCo(mjcf, substeps=2).execute(lambda t, x: next(again), task).states == pytest.approx(run.states)

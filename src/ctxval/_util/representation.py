@@ -7,7 +7,6 @@ Nothing of it identifies an object in a store: that is :mod:`ctxval._util.descri
 from __future__ import annotations
 
 import dataclasses
-import html
 import inspect
 import numbers
 import re
@@ -213,22 +212,3 @@ def name_of(function: Any) -> Shown:
 
 def _rest(count: int) -> list[str]:
     return [f"... {count - WIDTHS.items} more"] if count > WIDTHS.items else []
-
-
-def table(title: str, rows: Iterable[tuple[str, object]]) -> str:
-    """Return an HTML table of two columns without colours of its own, without rows of None, and with escaped texts."""
-    style = "text-align:left;color:inherit;background:transparent"
-    cell = f"{style};vertical-align:top;padding:0.2em 0.8em 0.2em 0.2em;border-bottom:1px solid currentColor"
-
-    def escaped(value: object) -> str:
-        return html.escape(line(value if isinstance(value, str) else shown(value), 500), quote=True)
-
-    given = [(name, value) for name, value in rows if value is not None]
-    if len(given) > 40:
-        given = [*given[:40], ("...", f"{len(given) - 40} more rows")]
-    body = "".join(
-        f'<tr><th scope="row" style="{cell}">{escaped(name)}</th><td style="{cell}">{escaped(value)}</td></tr>'
-        for name, value in given
-    )
-    caption = f'<caption style="{style};font-weight:bold">{escaped(title)}</caption>'
-    return f'<table style="border-collapse:collapse;color:inherit">{caption}<tbody>{body}</tbody></table>'

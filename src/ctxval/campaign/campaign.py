@@ -684,6 +684,3 @@ class Campaign:
     def __repr__(self) -> str:
         head = call(self, self.validation.space, name=self.name or None, seed=self.seed)
         return display.as_text(head, self.recorder)
-
-    def _repr_html_(self) -> str:
-        return display.as_html(self.name, self.seed, self.recorder)

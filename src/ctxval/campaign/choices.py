@@ -13,7 +13,7 @@ from ctxval._util.representation import call, fields_of, lines, shown
 from ctxval._util.texts import text_of
 from ctxval.core.plan import Plan, ended_early, least_distance, recorded_before_failure, recorded_until_end
 from ctxval.core.trajectory import COMPLETE, Trajectory
-from ctxval.core.trial import AT_LEAST, ENDED, Origin, State, Trial
+from ctxval.core.trial import AT_LEAST, ENDED, FELL, Origin, State, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import DistanceError, InputError
 
@@ -70,6 +70,8 @@ class Execution:
     unusable: str | None = None  #: the reason why the distance function gave no usable number
     #: the seconds after which the closed loops of M and S ended by a fall or an instability, None for one that did not
     ends: tuple[float | None, float] | None = None
+    #: the seconds after which the robots of M and S fell, None for one that did not; None if neither is known to
+    falls: tuple[float | None, float | None] | None = None
     lost: str | None = None  #: the reason why the worker was lost, which is not a failure of the system
     seconds: float | None = None  #: the duration, if it is known
 
@@ -103,16 +105,22 @@ class Execution:
         if self.failed is not None or self.distance is not None:
             return self
         run, of_model = self.trajectory, plan.model_trajectory
+        known = self
+        if isinstance(run, Trajectory) and not run.batch_shape and validation.fall is not None:
+            falls = validation.fall.seconds(of_model), validation.fall.seconds(run)
+            known = replace(self, falls=None if falls == (None, None) else falls)
         if isinstance(run, Trajectory) and ended_early(plan, run):
             tolerance = validation.start_tolerance if start_tolerance is None else start_tolerance
             run = recorded_until_end(plan, run, tolerance)
-            alone = of_model.ended == COMPLETE
+            alone = of_model.ended == COMPLETE and not validation.falls(run)
             end, end_of_model = (float(part.times[-1] - part.times[0]) for part in (run, of_model))
-            ended = replace(self, trajectory=run if run.horizon else None, ends=(None if alone else end_of_model, end))
+            ended = replace(known, trajectory=run if run.horizon else None)
+            if alone or of_model.ended != COMPLETE:
+                ended = replace(ended, ends=(None if alone else end_of_model, end))
             if alone:
                 return replace(ended, failed=run.ended)
             return ended._with_distance(lambda: validation.measure(plan, run))
-        return self._with_distance(lambda: validation.accept(plan, run, start_tolerance))
+        return known._with_distance(lambda: validation.accept(plan, run, start_tolerance))
 
     def _with_distance(self, measured: Callable[[], float]) -> Execution:
         try:
@@ -123,11 +131,13 @@ class Execution:
     def ended(self, trial: Trial, *, executed: bool = True) -> Trial:
         """Return a trial in the final state that this measured execution gives it."""
         state: State = "failed" if self.failed is not None else "unmeasured" if self.distance is None else "completed"
-        note = {key: value for key, value in (trial.note or {}).items() if key not in (AT_LEAST, ENDED)}
+        note = {key: value for key, value in (trial.note or {}).items() if key not in (AT_LEAST, ENDED, FELL)}
         if self.at_least is not None:
             note[AT_LEAST] = self.at_least
         if self.ends is not None:
             note[ENDED] = dict(zip(("model", "system"), self.ends, strict=True))
+        if self.falls is not None:
+            note[FELL] = dict(zip(("model", "system"), self.falls, strict=True))
         failure = self.unusable if self.failed is None else text_of(self.failed)
         ended = replace(trial, state=state, executed=executed, distance=self.distance, failure=failure)
         return replace(ended, seconds=self.seconds, note=note or None)

@@ -1,4 +1,4 @@
-"""Views of a campaign: as text, as an HTML table, and as a table of pandas."""
+"""Views of a campaign: as text, and as a table of pandas."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ctxval._util.representation import Shown, counted, lines, named, number, shown, table
+from ctxval._util.representation import Shown, counted, lines, named, number, shown
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TASK, TaskSuite
@@ -31,24 +31,6 @@ def as_text(head: str, recorder: TrialRecorder) -> str:
         f"trials: {_counts(recorder.trials)}",
         f"worst: {at}",
         f"store: {shown(recorder.store)}",
-    )
-
-
-def as_html(name: str, seed: int, recorder: TrialRecorder) -> str:
-    """Return a campaign as an HTML table, with one row for each parameter of the worst task."""
-    worst, units = recorder.trials.worst, recorder.validation.space.units
-    parameters = {} if worst is None else worst.parameters
-    return table(
-        f"Campaign {name}",
-        [
-            ("search", shown(recorder.search)),
-            ("seed", seed),
-            ("trials", _counts(recorder.trials)),
-            ("worst trial", "no distance is known" if worst is None else worst.number),
-            ("distance", None if worst is None else worst.distance),
-            *((name, f"{shown(value)} {units.get(name, '')}") for name, value in parameters.items()),
-            ("store", shown(recorder.store)),
-        ],
     )
 
 

@@ -20,13 +20,12 @@ from ctxval.campaign.storage.store import Store
 from ctxval.campaign.thinking import THINKING, CampaignThinking, TimeShortage
 from ctxval.certificates.checks import is_open
 from ctxval.certificates.dynamics import draws_for
-from ctxval.certificates.evidence import Evidence, Learned, Predicted
+from ctxval.certificates.evidence import Evidence, Learned
 from ctxval.certificates.explained import ExplainedExecution
 from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.predictions import CheckedPrediction
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.scenario import countable_draws
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import REDEFINED, Trial, Trials
 from ctxval.core.validation import Validation
@@ -341,7 +340,7 @@ class CampaignDynamics:
             low_dimensional=worst.points.shape[1] <= LIMITS.low_dimensional and self.study.planner.batched,
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
-            actuator=None if actuator is None else (actuator.delay, actuator.lag),
+            actuator=None if actuator is None else (float(actuator.delay), float(actuator.lag)),
             friction=learned.friction,
             untested_rest=learned.untested_rest,
             physical=learned.study.given.physical,
@@ -408,12 +407,6 @@ class CampaignDynamics:
                 self.use_quantile(kind.quantile)
                 evidence = self.evidence(trials, options.confidence)
                 return Learned(evidence, None if evidence is not None else self.failure)
-            if count := kind.predicted_tasks:
-                drawn = countable_draws(sample, f"a {kind.name} bound")
-                before = min(drawn.numbers)
-                tasks = space.unit_draws(count, np.random.default_rng([before, 0x7461]))  # a stream of no trial
-                both = self.expected(trials, np.concatenate([drawn.points, tasks]), before)
-                return Learned(predicted=Predicted(before, both[: len(drawn)], both[len(drawn) :]))
         return Learned()
 
     def stored_prediction(self, trial: Trial) -> ExecutionPrediction | None:

@@ -15,7 +15,7 @@ from ctxval.certificates.posterior import Diagnosis, DistanceBound, diagnose, in
 from ctxval.certificates.predictions import CheckedPrediction
 from ctxval.certificates.provenance import Neighbour, Provenance
 from ctxval.certificates.sample import PLANNED, RecoveredFailure, Sample, require_learned
-from ctxval.certificates.scenario import Audit, Region, SamplingDiscarding, Scenario, samples_needed, tail, volume_bound
+from ctxval.certificates.scenario import Audit, SamplingDiscarding, Scenario, samples_needed, tail, volume_bound
 from ctxval.certificates.stopping import StoppingDecision, StoppingRule
 from ctxval.certificates.verdict import Assessment, Verdict, assess, judge, judge_by
 from ctxval.core.coverage import StateInputCoverage, StateInputGap, UnsampledCorner, UnsampledParameter
@@ -42,7 +42,6 @@ __all__ = [
     "Neighbour",
     "Provenance",
     "RecoveredFailure",
-    "Region",
     "Sample",
     "SamplingDiscarding",
     "Scenario",

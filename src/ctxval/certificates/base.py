@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from ctxval._util.registry import Registry
-from ctxval._util.representation import ShortRepr, Shown, call, line, lines, table
+from ctxval._util.representation import ShortRepr, Shown, call, line, lines
 from ctxval._util.version import VERSION
 from ctxval.certificates.bounds import ERRORS, as_text, at_most, with_error
 from ctxval.certificates.sample import Sample
@@ -86,20 +86,6 @@ class Certificate:
         withdrawn = [] if self.doubt is None else [f"withdrawn: {line(self.doubt)}"]
         return lines(head, *withdrawn, line(self.statement), f"assumptions: {len(self.assumptions)}")
 
-    def _repr_html_(self) -> str:
-        rows = [
-            ("withdrawn", self.doubt),
-            ("statement", self.statement),
-            ("upper bound", with_error(self.upper_bound, self.error)),
-            ("confidence", Shown(f"{self.confidence:.6g}")),
-            ("volume left out", at_most(self.volume, 3)),
-            ("trials", self.trials),
-            *(("assumes", assumption) for assumption in self.assumptions),
-            ("distribution of tasks", self.distribution),
-            ("version", self.version),
-        ]
-        return table(f"Certificate: {self.kind}", rows)
-
 
 @dataclass(frozen=True)
 class CertificateKind(ShortRepr, ABC):
@@ -130,11 +116,6 @@ class CertificateKind(ShortRepr, ABC):
 
     quantile = QUANTILE
     """The share of the executions of each task that a threshold is about, if they differ by noise."""
-
-    @property
-    def predicted_tasks(self) -> int:
-        """The number of drawn tasks of which it reads the distances that are predicted without the draws."""
-        return 0
 
     @classmethod
     def options(cls) -> tuple[str, ...]:

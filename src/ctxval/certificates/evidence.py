@@ -218,18 +218,8 @@ class Evidence(ShortRepr):
 
 
 @dataclass(frozen=True, eq=False)
-class Predicted(ShortRepr):
-    """Distances that were predicted from the trials before one of them; NaN where nothing can be predicted."""
-
-    before: int  #: the number of the first trial that the predictions are not learned from
-    executed: Array  #: those of the trials from this one on that are independent draws ``(n,)``
-    drawn: Array  #: those of further tasks, independent draws from the distribution of tasks ``(N,)``
-
-
-@dataclass(frozen=True, eq=False)
 class Learned(ShortRepr):
     """What the experiment's model and the executions predict, for kinds of certificates that need more than trials."""
 
     evidence: Evidence | None = None  #: evidence on d*; None if nothing can be learned, or if the kind needs none
     failure: str | None = None  #: why nothing could be learned; None if that is not known
-    predicted: Predicted | None = None  #: predictions from earlier trials; None if the kind needs none

@@ -9,12 +9,6 @@ with equality for a continuous distribution of d. The paper's sum ends at k - 1,
 
 An audit is the scenario bound of the independent draws among trials of any origin. It assumes nothing about how the
 distance depends on the task, or about how the worst known task was found.
-
-A region bound is the scenario bound of the excess d - d_hat over a prediction that is fixed before: the margin q is the
-(k+1)-th largest excess. A task whose distance is not known, or cannot be predicted, has an infinite excess. Split
-conformal prediction computes the same margin (Vovk 2012; Campi and Garatti 2011 for k > 0). The tasks with d_hat(p) + q
-<= tau are a map of where tau is kept. Of M predicted tasks, j lie outside the map, and the Clopper-Pearson bound of
-their share is the same function of M, j and the confidence. The volume above tau is at most eps plus this bound.
 """
 
 from __future__ import annotations
@@ -26,27 +20,21 @@ from typing import ClassVar
 import numpy as np
 from scipy.special import bdtr, betaincinv
 
-from ctxval._util.arrays import Array
 from ctxval._util.checked import NonNegativeInt, PositiveInt, Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
-from ctxval.certificates.bounds import at_most, of_tasks
-from ctxval.certificates.sample import Sample, advice_to_remeasure, require_learned
+from ctxval.certificates.bounds import at_most
+from ctxval.certificates.sample import Sample, advice_to_remeasure
 from ctxval.certificates.sentences.statements import (
     ABOUT_DRAWS,
-    FROZEN,
     NO_BOUND,
     UNSEEN,
     how_drawn,
-    margin_and_map,
     share_above,
     violations,
 )
 from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError
-
-_OF_MAP = 0.05
-"""Share of beta for the volume of the map; the rest is for the draws. Predictions cost no execution, draws do."""
 
 
 @part("scenario")
@@ -223,101 +211,3 @@ class Audit(CertificateKind):
             "failed": sample.failed,
         }
         return self.certificate(sample, statement, h, confidence, assumptions, details, volume=volume, trials=n)
-
-
-# A prediction with a margin
-
-
-@part("region")
-@dataclass(frozen=True, repr=False)
-class Region(CertificateKind):
-    """Bound on the distance by a prediction and a margin, but for a share of the tasks; a map of where tau is kept."""
-
-    name: ClassVar[str] = "region"
-    bounds_maximum: ClassVar[bool] = False
-    uses_threshold: ClassVar[bool] = True
-    needs_model: ClassVar[bool] = True
-    sorts_draws: ClassVar[bool] = True
-
-    #: how many of the largest excesses are discarded; it must be chosen before the draws are known
-    discard: NonNegativeInt = 0
-    predictions: PositiveInt = 1000  #: number M of predicted tasks, to estimate the share that keeps the threshold
-
-    @property
-    def predicted_tasks(self) -> int:
-        """The number of tasks that are predicted."""
-        return self.predictions
-
-    @checked
-    def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
-        """Bound the distance by a prediction plus a margin from independent draws, but for a share of the tasks.
-
-        With a threshold, the bound is the threshold, and the volume left out is that of the draws plus that of the
-        tasks at which prediction plus margin exceeds it. Without one, the bound is the largest predicted one.
-        """
-        threshold, beta = sample.threshold, 1 - confidence
-        learned, drawn = require_learned(sample, "region"), countable_draws(sample, "a region bound")
-        assert learned.predicted is not None
-        before = learned.predicted.before  # the prediction is learned from the trials before the draws
-        margin, unpredicted = _margin(drawn, learned.predicted.executed, before, self.discard)
-        n = len(drawn)
-        volume = volume_bound(n, self.discard, (1 - _OF_MAP) * beta)
-        bounds = learned.predicted.drawn + margin
-        count, unknown = len(bounds), int(np.isnan(bounds).sum())
-        limit = float(bounds[~np.isnan(bounds)].max(initial=-np.inf)) if threshold is None else float(threshold)
-        outside = int((~(bounds <= limit)).sum())
-        if outside == count:
-            outside_volume = 1.0
-        elif threshold is not None:
-            outside_volume = volume_bound(count, outside, _OF_MAP * beta)
-        else:
-            # The tasks without a prediction, and those above the largest of the others, which the draws did not fix.
-            half = _OF_MAP * beta / 2
-            outside_volume = volume_bound(count, unknown, half) + volume_bound(count - unknown, 0, half)
-        total, share = min(1.0, volume + outside_volume), 1 - outside / count
-        smoothed = (outside + 1) / (count + 2)  # one more task on either side, so that the error is never zero
-        error = float(np.sqrt(smoothed * (1 - smoothed) / count))
-        kept = f"this prediction is at most {at_most(limit)} on each of {count} predicted tasks that it covers"
-        if threshold is not None:
-            tasks = f"{100 * share:.4g} ± {at_most(100 * error, 2)} % {of_tasks(sample.distribution)}"
-            kept = f"this prediction keeps {limit:.6g} on {tasks} (an estimate from {count} predicted tasks)"
-        statement = margin_and_map(sample, margin, volume, total, confidence, at_most(limit), kept)
-        chosen = "the number discarded was chosen before the draws were known"
-        assumptions = (*how_drawn(sample, drawn), chosen, FROZEN, *ABOUT_DRAWS)
-        details = {
-            "margin": margin,
-            "discarded": self.discard,
-            "volume_of_draws": volume,
-            "learned_before": before,
-            "predictions": count,
-            "share_kept": share,
-            "share_error": error,
-            "unpredicted_draws": unpredicted,
-            "unpredicted_tasks": unknown,
-            "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
-            "not_counted": len(sample.only("iid")) - n,
-            "failed": sample.failed,
-        }
-        return self.certificate(sample, statement, limit, confidence, assumptions, details, volume=total, trials=n)
-
-    def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
-        """Require more trials than are discarded."""
-        require_more(executions, self.discard, "draws")
-
-
-def _margin(drawn: Sample, predicted: Array, before: int, discard: int) -> tuple[float, int]:
-    """Return q, the (k+1)-th largest excess d - d_hat of draws, and how many of them cannot be predicted."""
-    if np.isnan(predicted).all():
-        raise CertificateError(
-            f"nothing can be predicted from the trials before trial {before}, the first of these draws: execute tasks "
-            "of a search before the audit, or say --kind audit, which needs no prediction."
-        )
-    require_more(len(drawn), discard, "draws")
-    excess = np.sort(np.nan_to_num(drawn.distances - predicted, nan=np.inf))
-    unpredicted = int((np.isnan(predicted) & ~np.isnan(drawn.distances)).sum())
-    if not np.isfinite(excess[-1 - discard]):
-        raise CertificateError(
-            f"{drawn.failed} of {len(drawn)} draws have no distance and {unpredicted} have no prediction, more than "
-            f"the {discard} discarded; nothing bounds the distance there.{advice_to_remeasure(drawn)}"
-        )
-    return float(excess[-1 - discard]), unpredicted

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from ctxval._util.checked import PositiveFloat, checked, require
-from ctxval._util.representation import ShortRepr, call, line, lines, shown, table
+from ctxval._util.representation import ShortRepr, call, line, lines, shown
 from ctxval.certificates.base import KINDS, Certificate, CertificateKind
 from ctxval.certificates.bets import bets_against
 from ctxval.certificates.bounds import NO_UNITS, Quantities
@@ -58,10 +58,6 @@ class Verdict:
         parts = {"witness": self.witness, "certificate": self.certificate, "expected": self.expected}
         known = (f"{name}: {shown(part)}" for name, part in parts.items() if part is not None)
         return lines(head, f"reason: {line(self.reason)}", *known)
-
-    def _repr_html_(self) -> str:
-        rows = {"threshold": self.threshold, "reason": self.reason, "rests on": self.rests_on, "next": self.next_task}
-        return table(f"Verdict: {self.answer}", rows.items())
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer and its reasons, ready for JSON; the certificate has its own."""

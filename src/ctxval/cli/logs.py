@@ -28,7 +28,6 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.data import Field, LogMapping, Observer
 from ctxval.errors import ExecutionError, InputError
 from ctxval.models import write_model
-from ctxval.report.replay_page import write_replay_page
 from ctxval.report.sections.repeat import run_command
 from ctxval.studies.survey import Survey, survey
 
@@ -167,7 +166,7 @@ def _without_task(opened: Opened, path: Path, reading: Logs) -> Iterator[_Run]:
 
 @command()
 def start(logs: list[Path], reading: Logs, out_: Path = Path("start"), force: bool = False, seed: int = 0) -> Any:
-    files = {name: out_ / name for name in ("mapping.toml", "model.npz", "experiment.toml", "report.html")}
+    files = {name: out_ / name for name in ("mapping.toml", "model.npz", "experiment.toml")}
     require_outputs({f"--out {name}": path for name, path in files.items()}, [*logs, reading.mapping], force=force)
     if not force:
         require_unedited(files["mapping.toml"])
@@ -179,7 +178,6 @@ def start(logs: list[Path], reading: Logs, out_: Path = Path("start"), force: bo
     _print_survey(result)
     write_toml(files["mapping.toml"], mapping_content(result.mapping, result.recordings.dt))
     write_model(files["model.npz"], result.best.model)
-    write_replay_page(result.replay, files["report.html"], name=f"the {result.best.kind} model")
     if result.recordings.inputs:
         write_toml(files["experiment.toml"], experiment_content(result))
     else:

@@ -1,31 +1,28 @@
-"""``ctxval replay``, ``ctxval fit`` and ``ctxval collect``: recordings of the system, and models learned from them."""
+"""``ctxval replay`` and ``ctxval fit``: recordings of the system, and models learned from them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from ctxval._util.files import read_toml
-from ctxval._util.refusals import reworded
 from ctxval._util.representation import counted, task_text
 from ctxval._util.texts import shortened
 from ctxval.cli import base
-from ctxval.cli.base import command, err, named_values, notes, out, print_columns, require_outputs
+from ctxval.cli.base import command, named_values, notes, out, print_columns, require_outputs
 from ctxval.cli.config.parts import part
 from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.settings import ExperimentSettings, read_settings
 from ctxval.core.experiment import Experiment
-from ctxval.core.labels import labels_of, names_of
+from ctxval.core.labels import names_of
 from ctxval.core.model import Model, as_model
 from ctxval.data import Field, LogMapping, Observer, Recordings, read_recordings
-from ctxval.errors import ExecutionError, InputError
+from ctxval.errors import InputError
 from ctxval.models import REGISTRY, read_model
 from ctxval.models.mujoco import is_sysid_result
-from ctxval.report.replay_page import write_replay_page
 from ctxval.studies.fitting import FitReport, FittedModel, FittedParameter, fit
-from ctxval.studies.fitting.excitation import Excitation, SignalKind
 from ctxval.studies.fitting.fit import HOLD_OUT, KINDS
 from ctxval.studies.fitting.fit import STEPS as FITTED
 from ctxval.studies.fitting.model_file import BESIDE, SUFFIXES, require_onnx, require_suffix, write_model_file
@@ -134,17 +131,14 @@ def replay(
     steps: str | None = None,
     executions: int = 10,
     seed: int = 0,
-    html: Path | None = None,
-    force: bool = False,
 ) -> Any:
-    require_outputs({"--html .html": html}, [*logs, model, experiment, reading.mapping], force=force)
     settings = None if experiment is None else read_settings(experiment, {})
     loaded = None if settings is None else settings.load()
     recordings = reading.read(logs, settings, loaded)
     if model is not None:
-        chosen, name = named_model(model, named_values(option), recordings.dt), Path(model).name
+        chosen = named_model(model, named_values(option), recordings.dt)
     elif loaded is not None:
-        chosen, name = loaded.validation.model, loaded.name
+        chosen = loaded.validation.model
     else:
         raise InputError("a model is needed: give --model, or --experiment for the model of an experiment.")
     wanted = REPLAYED if steps is None else numbers(steps)
@@ -152,12 +146,7 @@ def replay(
     report = compared(chosen, recordings, steps=wanted, validation=validation, executions=executions, seed=seed)
     units = "" if loaded is None else loaded.units
     _print_replay(report, units)
-    if html is None:
-        return report.to_json()
-    written = write_replay_page(report, html, name=name, units=units)
-    out.say("")
-    out.say(f"report: {written}")
-    return {**report.to_json(), "report": str(written)}
+    return report.to_json()
 
 
 def _print_replay(report: ReplayReport, units: str) -> None:
@@ -293,42 +282,6 @@ def _print_fit(report: FitReport) -> None:
             out.say((f"{model.kind}: ", "bold"), note, wrap=True)
     for failure in report.failed:
         notes.say((f"{failure.kind}: ", "yellow"), shortened(failure.reason))
-
-
-@command(signals=", ".join(get_args(SignalKind)))
-def collect(
-    target: str,
-    amplitude: str,
-    out_: Path = Path("logs"),
-    runs: int = 10,
-    kind: str = "multisine",
-    limits: str | None = None,
-    seed: int = 0,
-    option: list[str] | None = None,
-) -> Any:
-    settings = read_settings(target, {"options": named_values(option), "seed": seed})
-    experiment = settings.load()
-    size = base.parsed(amplitude)
-    if not isinstance(size, int | float | list):
-        raise InputError(f"--amplitude must be a number or a list such as [1.0, 0.5], got {amplitude!r}.")
-    allowed = None if limits is None else base.parsed(limits)
-    excitation = Excitation(experiment.validation, kind, size, allowed, seed)  # type: ignore[arg-type]
-    with reworded(f"{out_} cannot be made", OSError):
-        out_.mkdir(parents=True, exist_ok=True)
-    paths = [out_ / f"run{number:04d}.csv" for number in range(runs)]
-    missing = [number for number, path in enumerate(paths) if not path.exists()]
-    recorded, failed, known = list[str](), list[dict[str, Any]](), runs - len(missing)
-    for number, run in excitation.runs(missing):
-        if isinstance(run, ExecutionError):
-            failed.append({"run": number, "reason": str(run)})
-            err.say((f"run {number} failed", "yellow"), f": {run}")
-        else:
-            states, inputs = experiment.names(run.states.shape[-1], run.inputs.shape[-1])
-            run.to_csv(paths[number], states=labels_of(states), inputs=labels_of(inputs))
-            recorded.append(str(paths[number]))
-    out.say(f"{len(recorded)} executions recorded in {out_}, {known} were there before, {len(failed)} failed.")
-    report = {"recorded": recorded, "known": known, "failed": failed, "folder": str(out_)}
-    return (report, base.CANNOT_GO_ON) if failed and not recorded and not known else report
 
 
 def numbers(text: str) -> list[int]:

@@ -1,4 +1,4 @@
-"""``ctxval init``, ``check``, ``cases`` and ``reproduce``: experiment files, the built-in cases and the paper."""
+"""``ctxval init``, ``check`` and ``cases``: experiment files and the built-in cases of the paper."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from rich.progress import Progress, TextColumn
-
 from ctxval._util.files import write_text
 from ctxval._util.texts import shell_word
 from ctxval._util.toml import toml_text
-from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, err, named_values, out, print_table
+from ctxval.cli import policies
+from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, named_values, out, print_table
 from ctxval.cli.config.check import aspect1_findings, check_experiment
 from ctxval.cli.config.parts import part, plain_options
 from ctxval.cli.config.settings import read_settings
@@ -26,9 +25,21 @@ from ctxval.studies.safety.draws import spec_distance
 
 
 @command()
-def init(file: Path = Path("experiment.toml"), hardware: bool = False) -> Any:
+def init(
+    file: Path = Path("experiment.toml"),
+    hardware: bool = False,
+    policy: Path | None = None,
+    mjcf: Path | None = None,
+    descriptor: Path | None = None,
+) -> Any:
     if file.suffix != ".toml":
         raise InputError(f"an experiment file ends in .toml, got {str(file)!r}.")
+    if policy is not None:
+        if mjcf is None or hardware:
+            raise InputError("--policy needs --mjcf, the robot of the policy, and no --hardware.")
+        return _init_policy(file, policy, mjcf, descriptor)
+    if mjcf is not None or descriptor is not None:
+        raise InputError("--mjcf and --descriptor need --policy.")
     kind = "rig" if hardware else "system"
     module = "".join(c if c.isascii() and c.isalnum() else "_" for c in file.stem) + f"_{kind}"
     paths = {"experiment.toml": file, f"{kind}.py.txt": file.with_name(f"{module}.py")}
@@ -45,12 +56,23 @@ def init(file: Path = Path("experiment.toml"), hardware: bool = False) -> Any:
     for example, path in paths.items():
         text = (Path(__file__).parent / "example" / example).read_text("utf-8")
         write_text(path, Template(text).substitute(name=shell_word(file.name), about=about, system=system))
-    quoted = shell_word(file)
-    written = [str(path) for path in paths.values()]
-    out.say(" and ".join(written))
-    out.say(f"next: ctxval check {quoted}")
-    out.say(f"then: ctxval run {quoted}")
-    return {"files": written}
+    return _written(file, [*paths.values()])
+
+
+def _init_policy(file: Path, policy: Path, mjcf: Path, descriptor: Path | None) -> Any:
+    if file.exists():
+        raise InputError(f"{file} already exists and was not changed.")
+    written, guessed = policies.write_experiment(file, policy, mjcf, descriptor)
+    if guessed:
+        out.say(f"the contract of the policy is guessed: {guessed}")
+    return _written(file, written) | {"guessed": guessed or None}
+
+
+def _written(file: Path, paths: list[Path]) -> dict[str, Any]:
+    out.say(" and ".join(map(str, paths)))
+    out.say(f"next: ctxval check {shell_word(file)}")
+    out.say(f"then: ctxval run {shell_word(file)}")
+    return {"files": [str(path) for path in paths]}
 
 
 @command(tasks=model_alone.TASKS)
@@ -113,24 +135,3 @@ def cases(name: str | None = None) -> Any:
         return {each: text for each, (text, _) in listed.items()}
     text, options = listed[name]
     return {"case": name, "text": text, "options": options}
-
-
-@command(with_json=False)
-def reproduce(
-    name: str, quick: bool = False, out_: Path = Path("reproduction"), results: Path | None = None, workers: int = 2
-) -> None:
-    from ctxval.paper import reproduce as paper  # imported here: the other commands do not need it
-
-    with Progress(TextColumn("runs"), *Progress.get_default_columns(), console=err) as progress:
-        line = progress.add_task("")
-        table = paper.reproduce(
-            name,
-            out_,
-            stored=results,
-            scale=paper.QUICK if quick else paper.FULL,
-            workers=workers,
-            on_start=lambda missing: progress.update(line, total=missing),
-            on_done=lambda job: progress.update(line, advance=1, description=job.key),
-        )
-    out.say(f"table: {table}")
-    out.say(f"figures and data: {out_}")

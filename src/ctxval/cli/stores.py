@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -178,11 +179,15 @@ def write_report(
     page: Path | None = None,
     junit: Path | None = None,
     markdown: Path | None = None,
+    card: Path | None = None,
+    origin: str = "",
     force: bool = False,
 ) -> Any:
     opened = Store.existing(store)
     target = store.with_suffix(".report.html") if page is None else page
-    outputs = {"--out .html": target, "--junit .xml": junit, "--markdown .md": markdown}
+    beside = None if card is None else card.with_suffix(".json")
+    outputs = {"--out .html": target, "--junit .xml": junit, "--markdown .md": markdown, "--card .md": card}
+    outputs["--card .json"] = beside
     base.require_outputs(outputs, [store, allowed.experiment], force=force)
     require("threshold", PositiveFloat | None, asked.threshold)
     try:
@@ -205,6 +210,10 @@ def write_report(
         written["junit"] = str(write_text(junit, reports.junit(context)))
     if markdown is not None:
         written["markdown"] = str(write_text(markdown, reports.markdown(context)))
+    if card is not None and beside is not None:
+        made = reports.card(context, origin)
+        written["card"] = str(write_text(card, made.markdown()))
+        written["card as JSON"] = str(write_text(beside, json.dumps(made.to_json(), indent=1) + "\n"))
     out.say(", ".join(written.values()))
     if context.missing:
         out.say(f"without the experiment: {context.missing}", wrap=True)

@@ -9,15 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ctxval import Campaign, Store, Validation, plot
+from ctxval import Campaign, Store, Validation
 from ctxval._util.checked import PositiveFloat, PositiveInt, require
-from ctxval._util.files import write_text
 from ctxval._util.representation import task_text
-from ctxval._util.texts import enumerated, reason_of
+from ctxval._util.texts import enumerated
 from ctxval.certificates import CertificateOptions
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.cli import base
-from ctxval.cli.base import Allowed, command, err, named_values, notes, out, print_columns, print_table, require_outputs
+from ctxval.cli.base import Allowed, command, named_values, notes, out, print_columns, print_table
 from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.settings import ExperimentSettings, read_settings
 from ctxval.cli.config.stored_settings import Limits, open_target
@@ -46,12 +45,8 @@ def compare(
     stores: Path = Path("runs/compare"),
     largest_possible: float | None = None,
     stochastic: bool = False,
-    out_: Path | None = None,
-    force: bool = False,
     option: list[str] | None = None,
 ) -> Any:
-    picture = None if out_ is None else out_.with_suffix(".png")
-    require_outputs({"--out .md": out_, "its picture": picture}, candidates, force=force)
     campaigns = _candidates(candidates, stores, seed, named_values(option))
     comparison = run_comparison(
         campaigns,
@@ -66,15 +61,8 @@ def compare(
     _print_comparison(comparison)
     for value in failures.values():
         base.print_failures(value)
-    files = []
-    if out_ is not None:
-        files.append(str(write_text(out_, comparison.to_markdown())))
-        try:
-            files.append(str(plot.save(comparison.plot(), out_.with_suffix(".png"))))
-        except Exception as error:  # it must not hide the decisions, for which executions were paid
-            err.say(f"no picture: {reason_of(error)}")
     paths = {name: str(campaign.store.path) for name, campaign in campaigns.items()}
-    return {**comparison.to_json(), "stores": paths, "failures": failures, "files": files}
+    return {**comparison.to_json(), "stores": paths, "failures": failures}
 
 
 def _candidates(texts: Sequence[str], folder: Path, seed: int, options: dict[str, Any]) -> dict[str, Campaign]:

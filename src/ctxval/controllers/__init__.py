@@ -9,6 +9,9 @@ from ctxval.controllers.mpc import MPC, RecedingHorizon
 from ctxval.controllers.onnx_policy import OnnxPolicy, RecurrentPolicy
 from ctxval.controllers.output_feedback import EstimatedFeedback, OutputFeedback
 from ctxval.controllers.pid import PID, PIDFeedback
+from ctxval.controllers.policy_contract import Action, PolicyContract, Term
+from ctxval.controllers.policy_descriptors import convert_policy
+from ctxval.controllers.robot_policy import PolicyController, RobotPolicy
 from ctxval.core.controller import (
     AffineFeedback,
     BoundPolicy,
@@ -20,6 +23,7 @@ from ctxval.core.controller import (
     started,
 )
 from ctxval.core.exchange import ControllerFile, read_controller, write_controller
+from ctxval.core.floating_base import Fall, FloatingBase
 
 __all__ = [
     "ILQR",
@@ -27,23 +31,31 @@ __all__ = [
     "MPC",
     "PID",
     "REGISTRY",
+    "Action",
     "AffineFeedback",
     "BoundPolicy",
     "ControllerFile",
     "ControllerRun",
     "ControllerWithMemory",
     "EstimatedFeedback",
+    "Fall",
+    "FloatingBase",
     "ILQRSolution",
     "Limits",
     "OnnxPolicy",
     "OutputFeedback",
     "PIDFeedback",
     "Policy",
+    "PolicyContract",
+    "PolicyController",
     "RecedingHorizon",
     "RecurrentPolicy",
+    "RobotPolicy",
     "StationaryLQR",
     "Synthesizer",
+    "Term",
     "by_name",
+    "convert_policy",
     "read_controller",
     "started",
     "write_controller",

@@ -12,6 +12,8 @@ from ctxval._util.checked import PositiveInt, Seconds, checked
 from ctxval._util.representation import call
 from ctxval.errors import InputError, ShapeError
 
+COMMAND = "command"  #: the entry of the environment that is the command
+
 
 @checked
 class Task:
@@ -29,6 +31,7 @@ class Task:
             that of the suite.
         environment: what else a design, a distance or a specification reads, such as the place of an obstacle: names
             with lists of numbers, each given like ``initial_state`` and with a width of its own.
+        command: what a policy is told to do, such as velocities: the entry ``command`` of the environment.
     """
 
     def __init__(
@@ -41,6 +44,7 @@ class Task:
         reference: Any = None,
         name: Any = "",
         environment: Mapping[str, Any] | None = None,
+        command: Any = None,
     ) -> None:
         if goal is not None and reference is not None:
             raise InputError("a task must have a goal or a reference, not both.")
@@ -58,7 +62,12 @@ class Task:
             target = np.zeros((1, n))
         if not (np.isfinite(state).all() and np.isfinite(target).all()):
             raise InputError("a task must have a finite initial_state and a finite goal or reference.")
-        around = {key: _components(f"environment {key!r}", given) for key, given in (environment or {}).items()}
+        entries = dict(environment or {})
+        if command is not None:
+            if COMMAND in entries:
+                raise InputError("a task must have one command, and its environment has another one.")
+            entries[COMMAND] = command
+        around = {key: _components(f"environment {key!r}", given) for key, given in entries.items()}
         for key, given in around.items():
             as_finite(f"environment {key!r}", given)
         shapes = [given.shape[:-1] for given in around.values()]
@@ -87,6 +96,13 @@ class Task:
     def goal(self) -> Array:
         """The last state of the reference, shape ``(..., n)``."""
         return self.reference[..., -1, :]
+
+    @property
+    def command(self) -> Array:
+        """The command, shape ``(..., k)``."""
+        if COMMAND not in self.environment:
+            raise InputError("the task must have a command, as in Task(..., command=[0.5, 0.0, 0.2]).")
+        return self.environment[COMMAND]
 
     @property
     def times(self) -> Array:

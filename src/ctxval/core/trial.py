@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ctxval._util.arrays import Array, read_only
-from ctxval._util.representation import ShortRepr, call, counted, line, lines, table
+from ctxval._util.representation import ShortRepr, call, counted, line, lines
 from ctxval.core.space import Point
 
 Origin = Literal["iid", "spread", "initial", "acquisition", "covering", "manual"]
@@ -35,6 +35,9 @@ ENDED = "ends"
 
 The times are in seconds, null for a loop that did not end. If S alone did, M was wrong by more than any distance.
 """
+
+FELL = "falls"
+"""Key in the note of a trial in which a robot fell: the seconds after which that of M and that of S did, or null."""
 
 TOLD_ALONE = "its distance was told without a trajectory, and the distance has changed since: execute the task again."
 """The failure of a trial that was reported without a trajectory, so that a new distance cannot be computed."""
@@ -90,11 +93,6 @@ class Trial:
         head = call(self, self.number, origin=self.origin, state=self.state, **ended, parameters=self.parameters)
         texts = {"failure": self.failure, "because": self.because}
         return lines(head, *(f"{name}: {line(text)}" for name, text in texts.items() if text is not None))
-
-    def _repr_html_(self) -> str:
-        names = ("origin", "state", "distance", "failure", "seconds", "attempts", "because")
-        known = ((name, getattr(self, name)) for name in names)
-        return table(f"Trial {self.number}", [*known, *self.parameters.items()])
 
 
 class Trials(tuple[Trial, ...]):
@@ -164,6 +162,10 @@ def designs_sentence(trials: Sequence[Trial]) -> str | None:
     if early := sum(ENDED in (trial.note or {}) for trial in executed if trial.distance is not None):
         what = f"{early} of {len(executed)} executions ended early on M and S, by a fall or an instability"
         parts.append(f"{what}, and distances are over the common part")
+    falls = [(trial.note or {})[FELL] for trial in executed if FELL in (trial.note or {})]
+    if falls:
+        of_model, of_system = (sum(fall.get(whose) is not None for fall in falls) for whose in ("model", "system"))
+        parts.append(f"the robot fell in {of_system} of {len(executed)} executions, and on M in {of_model}")
     rejected = sum(count for trial in trials if isinstance(count := (trial.note or {}).get(UNSTEADY), int))
     if rejected:
         tasks = f"{counted(rejected, 'task')} {'was' if rejected == 1 else 'were'} not executed"

@@ -22,6 +22,7 @@ from ctxval._util.representation import call, lines, shown
 from ctxval._util.texts import parted, reason_of
 from ctxval.core.controller import Controller, Synthesizer, is_controller
 from ctxval.core.distance import Distance
+from ctxval.core.floating_base import Fall, UntilFall, until_fall
 from ctxval.core.labels import Labels, names_of, require_names
 from ctxval.core.model import Model, Step, as_model, require_time_step
 from ctxval.core.plan import Outcome, Plan, ended_early, recorded_until_end, require_complete, require_execution
@@ -47,7 +48,8 @@ class Validation:
         space: the task space P.
         task: a function ``p -> Task``, which is called with the named parameters of one task or of a batch.
         system, model: the true system S, and the model M, which may be a function ``(x, u) -> x_next``.
-        synthesizer: designs the controllers on M.
+        synthesizer: designs the controllers on M. If it has the condition of a ``fall``, a robot lies still from its
+            fall on in all distances.
         distance: the distance d between the trajectories of M and S.
         start_tolerance: the largest permitted difference between the first state of an execution and the initial state
             of its task, as a fraction of the range of each state in the trajectory of the model, or of its initial
@@ -91,7 +93,9 @@ class Validation:
         states = self.labels.states or tuple(names_of(system, "states"))
         require_names(states, self.labels.inputs or names_of(system, "inputs"))
         named = getattr(distance, "with_states", None)
-        self.distance: Distance = named(tuple(parted(label)[0] for label in states)) if callable(named) else distance
+        if callable(named):
+            distance = named(tuple(parted(label)[0] for label in states))
+        self.distance: Distance = until_fall(distance, synthesizer)
         self.start_tolerance = float(start_tolerance)
         self.longest = int(longest)
         self.physical = tuple(dict.fromkeys(physical))
@@ -193,18 +197,27 @@ class Validation:
     def require(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> Trajectory:
         """Return a trajectory that is a complete and finite execution of a plan; refuse any other.
 
-        If the closed loops of both M and S ended early, by a fall or an instability, it is the steps before. If only
-        one of them did, there is no distance. An InputError says that it belongs to another task. A start tolerance
-        replaces that of this validation.
+        If the closed loops of both M and S ended early, by a fall or an instability, or that of S at a fall that the
+        synthesizer knows, it is the steps before. If only one of them did otherwise, there is no distance. An
+        InputError says that it belongs to another task. A start tolerance replaces that of this validation.
         """
         tolerance = self.start_tolerance if start_tolerance is None else start_tolerance
         if not isinstance(trajectory, Trajectory):
             raise ExecutionError(f"the system returned {type(trajectory).__name__} instead of a Trajectory")
-        if ended_early(plan, trajectory) and plan.model_trajectory.ended != COMPLETE:
+        if ended_early(plan, trajectory) and (plan.model_trajectory.ended != COMPLETE or self.falls(trajectory)):
             return recorded_until_end(plan, trajectory, tolerance)
         require_complete(plan, trajectory)
         require_execution(plan, trajectory, tolerance)
         return trajectory
+
+    def falls(self, trajectory: Trajectory) -> bool:
+        """Return whether the robot of a trajectory falls, by the condition that the synthesizer knows."""
+        return self.fall is not None and self.fall.seconds(trajectory) is not None
+
+    @property
+    def fall(self) -> Fall | None:
+        """The condition of a fall that the synthesizer knows; None if it knows none."""
+        return self.distance.fall if isinstance(self.distance, UntilFall) else None
 
     def accept(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> float:
         """Check that a trajectory is an execution of a plan, as :meth:`require` does, and return its distance.

@@ -17,19 +17,24 @@ from ctxval.distances.deviations import (
     TrackingError,
     WholeTrajectory,
 )
+from ctxval.distances.motion import BodyVelocity, CommandError, FallTime, Orientation
 from ctxval.distances.unsafe_margin import UnsafeMargin
 
 __all__ = [
     "REGISTRY",
     "AtCrossing",
     "AtTimes",
+    "BodyVelocity",
+    "CommandError",
     "ComposedDistance",
     "CrossingTime",
     "Distance",
+    "FallTime",
     "FinalState",
     "GoalError",
     "MaximumDeviation",
     "MeanDeviation",
+    "Orientation",
     "RelativeDeviation",
     "StateNorm",
     "TrackingError",

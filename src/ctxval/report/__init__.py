@@ -13,6 +13,7 @@ from pathlib import Path
 
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import CertificateOptions, Verdict
+from ctxval.report.card import Card, CardVerdict, card
 from ctxval.report.charts import Axis, Chart
 from ctxval.report.context import ReportContext, context_of_campaign, context_of_store
 from ctxval.report.findings import Finding
@@ -22,11 +23,14 @@ from ctxval.report.page import SECTIONS, Section, junit, markdown, page, to_json
 __all__ = [
     "SECTIONS",
     "Axis",
+    "Card",
+    "CardVerdict",
     "Chart",
     "Finding",
     "ReportContext",
     "Section",
     "bullets",
+    "card",
     "context_of_campaign",
     "context_of_store",
     "element",

@@ -25,6 +25,7 @@ from ctxval.certificates.scenario import volume_bound
 from ctxval.certificates.verdict import Verdict
 from ctxval.core.controller import converged_of
 from ctxval.core.distance import Distance
+from ctxval.core.floating_base import UntilFall
 from ctxval.core.plan import Plan
 from ctxval.core.soundness import Flips, InputSaturation, aimed_states, flips, saturation
 from ctxval.core.task import Task
@@ -156,6 +157,7 @@ def completion(validation: Validation) -> Distance:
     synthesizer does not bring to a goal.
     """
     space, distance = validation.space, validation.distance
+    distance = distance.distance if isinstance(distance, UntilFall) else distance
     task = validation.task_at(space.parameters(0.5 * (space.low + space.high)))
     if not isinstance(task, Task) or not task.has_goal:
         raise InputError(

@@ -1,10 +1,8 @@
-"""Actuators that act late: the definition of a delay and of a lag for simulations, learned dynamics and causes."""
+"""Actuators that act late: the definition of a delay and of a lag for simulations, learned dynamics and effects."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -15,43 +13,62 @@ from ctxval._util.arrays import Array
 class Actuator:
     """How the inputs act that a controller commands; before the first one, they are 0.
 
-    A step of a system takes one input, so what acts in a step is the mean over it.
+    A step of a system takes one input, so what acts in a step is the mean over it. Both sizes may be those of draws
+    ``(S, 1)``; the inputs are then ``(S, q, m)``.
     """
 
-    delay: float = 0.0  #: steps by which inputs act late; between whole steps, two inputs act in parts
+    delay: float | Array = 0.0  #: steps by which inputs act late; between whole steps, two inputs act in parts
     #: time constant in steps of the first-order lag with which delayed inputs are followed; 0 if there is none
-    lag: float = 0.0
+    lag: float | Array = 0.0
 
-    def follow(self, u: Array, memory: Any = None, parts: int = 1) -> tuple[Array, Any]:
-        """Return the inputs that act ``(..., m)`` for those that are commanded, and a memory; None at the first step.
+    @property
+    def _late(self) -> int:
+        """The number of earlier commands that may act in a step."""
+        return int(np.ceil(np.max(self.delay)))
+
+    def remembered(self, inputs: int) -> int:
+        """Return the number of values that it remembers of so many inputs."""
+        return (self._late + bool(np.any(self.lag))) * inputs
+
+    def follow(self, u: Array, memory: Array | None = None, parts: int = 1) -> tuple[Array, Array]:
+        """Return the inputs that act ``(..., m)`` for those that are commanded, and the new memory ``(..., k)``.
 
         With parts, they are the means over these parts of the step, ``(..., parts, m)``. The memory has the latest
-        commands, the latest first, and what the lag has reached when the step ends.
+        commands, the latest first, and what the lag has reached when the step ends; None, or zeros, at the first step.
         """
-        whole, late = int(self.delay), parts * (self.delay % 1.0)
-        commanded, reached = ((), np.zeros_like(u)) if memory is None else memory
-        commanded = (u, *commanded)[: whole + 2]
-        newer, older = ((*commanded, *[np.zeros_like(u)] * (whole + 2))[whole + k] for k in (0, 1))
-        weights = np.clip(np.arange(1, parts + 1) - late, 0.0, 1.0) if late else np.ones(parts)
-        weights = weights.reshape(-1, *[1] * np.ndim(u))
-        acting = weights * newer + (1 - weights) * older
-        for part in acting if self.lag else ():
-            part[...], reached = self._followed(reached, part, parts)
-        return acting[0] if parts == 1 else np.moveaxis(acting, 0, -2), (commanded, reached)
+        late, m = self._late, u.shape[-1]
+        memory = np.zeros((*u.shape[:-1], self.remembered(m))) if memory is None else memory
+        commands = np.concatenate([u, memory[..., : late * m]], axis=-1)
+        acting = self._due([commands[..., k * m : (k + 1) * m] for k in range(late + 1)], parts)
+        kept, reached = commands[..., : late * m], memory[..., late * m :]
+        for k in range(parts) if reached.shape[-1] else ():
+            acting[..., k, :], reached = self._followed(reached, acting[..., k, :], parts)
+        acting = acting[..., 0, :] if parts == 1 else acting
+        return acting, np.concatenate([kept, reached], axis=-1)
 
-    def acting(self, inputs: Array) -> Array:
-        """Return the inputs that act in each step, for commanded ones ``(..., H, m)``."""
-        H, due = inputs.shape[-2], np.zeros_like(inputs)
-        whole, share = int(self.delay), self.delay % 1.0
-        for weight, back in ((1.0 - share, whole), (share, whole + 1)):
-            due[..., back:, :] += weight * inputs[..., : max(H - back, 0), :]
-        reached = np.zeros_like(due[..., 0, :])
-        for t in range(H) if self.lag else ():
-            due[..., t, :], reached = self._followed(reached, due[..., t, :])
+    def acting(self, inputs: Array, parts: int = 1) -> Array:
+        """Return the inputs that act in each step, for commanded ones ``(..., H, m)``; see :meth:`follow`."""
+        late, commands = self._late, np.moveaxis(inputs, -2, 0)
+        padded = np.concatenate([np.zeros((late, *commands.shape[1:])), commands])
+        due = self._due([padded[late - k : len(padded) - k] for k in range(late + 1)], parts)
+        reached = np.zeros_like(commands[0])
+        for t in range(len(due)) if np.any(self.lag) else ():
+            for k in range(parts):
+                due[t, ..., k, :], reached = self._followed(reached, due[t, ..., k, :], parts)
+        return np.moveaxis(due[..., 0, :] if parts == 1 else due, 0, inputs.ndim - 2)
+
+    def _due(self, commands: list[Array], parts: int) -> Array:
+        """Return the means ``(..., parts, m)`` over parts of a step of commands, the latest first, that are delayed."""
+        ends = np.arange(parts + 1) / parts
+        due = np.zeros((*commands[0].shape[:-1], parts, commands[0].shape[-1]))
+        for k, command in enumerate(commands):
+            begins = np.asarray(self.delay)[..., None] - k  # the command acts from here on, for a step
+            share = parts * np.maximum(np.minimum(ends[1:], begins + 1) - np.maximum(ends[:-1], begins), 0.0)
+            due += share[..., None] * command[..., None, :]
         return due
 
-    def _followed(self, reached: Array, due: Array, parts: int = 1) -> tuple[Array, Array]:
+    def _followed(self, reached: Array, due: Array, parts: int) -> tuple[Array, Array]:
         """Return the mean over a part of a step of what approaches the inputs that are due, and what it reaches."""
-        lag, missing = parts * self.lag, reached - due
-        gone = math.exp(-1 / lag)
+        lag, missing = parts * np.asarray(self.lag)[..., None], reached - due
+        gone = np.exp(-1 / np.maximum(lag, 1e-300))
         return due + missing * (lag * (1 - gone)), due + missing * gone

@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, as_floats
+from ctxval._util.arrays import Array, ArrayLike, as_finite, as_floats
 from ctxval._util.checked import NonNegativeFloat, Seconds
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
@@ -84,9 +84,9 @@ class Manual:
         raise ExecutionError(f"a manual system is executed by people; {advice}.")
 
 
-@part(functions={"step": "(x, u) -> x_next"})
+@part(functions={"step": "(x, u) -> x_next"}, parts={"step": "model"})
 class Imperfect:
-    """A step function or a model as the true system, whose records and actuators are imperfect.
+    """A step function or a model, such as a simulator, as the true system, whose records and actuators are imperfect.
 
     The controller acts on the records, as on a robot. Executions of one task differ if there is noise.
 
@@ -95,9 +95,13 @@ class Imperfect:
         process: standard deviations of the noise of each state in each step.
         measurement: standard deviations of the noise of each recorded state.
         resolution: steps to which records are rounded, as an encoder does; 0 for a state that is not rounded.
-        delay: steps by which inputs act late; it need not be an integer. Before the first one, the input is 0.
+        delay: steps by which inputs act late; it need not be an integer.
         lag: time constant in steps with which the actuators approach the input; 0 if they follow at once. The mean over
             a step acts in it.
+        before: the inputs before the first one acts, a number or shape ``(m,)``, such as the pose of servos.
+        strength: factor of the inputs that act, a number or shape ``(m,)``, such as that of weak motors.
+        push: what a push adds to states, by their indices, such as ``{7: 0.5}``; None if there is none.
+        push_time: seconds after which it does, rounded to a step.
         seed: with a seed, noise is a function of it, of the task and of how often this object has executed.
     """
 
@@ -113,6 +117,10 @@ class Imperfect:
         resolution: ArrayLike = 0.0,
         delay: NonNegativeFloat = 0.0,
         lag: NonNegativeFloat = 0.0,
+        before: ArrayLike = 0.0,
+        strength: ArrayLike = 1.0,
+        push: Mapping[Any, float] | None = None,
+        push_time: NonNegativeFloat = 0.0,
         vectorized: bool = False,
         seed: int | None = None,
     ) -> None:
@@ -123,11 +131,22 @@ class Imperfect:
         for name in ("start", "process", "measurement", "resolution"):
             if not (np.isfinite(getattr(self, name)) & (getattr(self, name) >= 0)).all():
                 raise InputError(f"{name} must be finite and not negative, got {getattr(self, name).tolist()}.")
-        self.delay, self.lag, self.seed = delay, lag, seed
+        self.before, self.strength = as_finite("before", before), as_finite("strength", strength)
+        with reworded("push must be numbers by the indices of states", ValueError, TypeError):
+            self.push = {int(index): float(change) for index, change in (push or {}).items()}
+        self.delay, self.lag, self.seed, self.push_time = delay, lag, seed, push_time
         self._executed = 0
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this system in a store."""
+        known = {name: value for name, value in vars(self).items() if not name.startswith("_")}
+        usual = {"before": not self.before.any(), "strength": (self.strength == 1.0).all(), "push": not self.push}
+        usual["push_time"] = usual["push"]
+        return {name: value for name, value in known.items() if not usual.get(name)}
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         """Run the closed loop from the initial state of the task over its horizon; batches have noise of their own."""
+        pushed = round(self.push_time / task.dt) if self.push else -1
         start, rng = np.array(task.initial_state, dtype=np.float64), np.random.default_rng()
         if self.seed is not None:
             self._executed += 1
@@ -135,7 +154,7 @@ class Imperfect:
             rng = np.random.default_rng([self.seed, of_task, self._executed])
         if self.start.any():
             start = start + self.start * rng.standard_normal(start.shape)
-        actuator, truth, memory = Actuator(self.delay, self.lag), start, None
+        actuator, truth, memory, steps = Actuator(self.delay, self.lag), start, None, 0
         of_model = run_of(self.model, start)
 
         def record(x: Array) -> Array:
@@ -144,9 +163,13 @@ class Imperfect:
             return np.asarray(np.where(self.resolution > 0, np.round(read / unit) * unit, read))
 
         def step(_: Array, u: Array) -> Array:
-            nonlocal truth, memory
-            u, memory = actuator.follow(np.array(u), memory)
-            truth = of_model(truth, u)
+            nonlocal truth, memory, steps
+            if steps == pushed:
+                truth = np.array(truth)
+                truth[..., list(self.push)] += list(self.push.values())
+            steps += 1
+            u, memory = actuator.follow(u - self.before, memory)
+            truth = of_model(truth, self.strength * (u + self.before))
             if self.process.any():
                 truth = truth + self.process * rng.standard_normal(truth.shape)
             return record(truth)

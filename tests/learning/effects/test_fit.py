@@ -43,3 +43,15 @@ def test_noise_hides_neither_an_effect_nor_that_it_is_wrong() -> None:
     share, _ = segments.explained(half, noise)  # of the squares: 1 - 0.5**2
     assert share == pytest.approx(0.75, abs=0.02)
     assert segments.explained(right, 0 * noise)[1] == 0.0
+
+
+def test_residuals_of_draws_are_those_of_each_draw() -> None:
+    segments = Segments(MODEL, runs(0.7, np.zeros(2)))
+    gains, delays = np.array([[0.7], [0.9]]), np.array([[0.4], [1.6]])
+    together = ModelWithEffects(MODEL, (effects.InputGain((gains,), 0), effects.Delay((delays,), held=False)), 1)
+    for window in segments.windows:
+        left = segments.left_by(together, window)
+        for k, (gain, delay) in enumerate(zip(gains[:, 0], delays[:, 0], strict=True)):
+            alone = (effects.InputGain((gain,), 0), effects.Delay((delay,), held=False))
+            expected = segments.left_by(ModelWithEffects(MODEL, alone, 1), window)
+            np.testing.assert_allclose(left[k], expected, rtol=1e-9, atol=1e-12)

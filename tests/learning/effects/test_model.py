@@ -10,7 +10,6 @@ import pytest
 from ctxval import Array, Task, controllers, models, systems
 from ctxval.learning import effects
 from ctxval.learning.effects import Effect, Joint, ModelWithEffects
-from ctxval.learning.effects.flow import Flow
 
 DT = 0.05
 MODEL = models.Linear([[1.0, DT], [0.0, 1.0]], [[0.5 * DT**2], [DT]])
@@ -47,12 +46,6 @@ def test_a_lag_lets_the_mean_of_an_exponential_act() -> None:
     np.testing.assert_allclose(acting, exact, rtol=1e-12)
 
 
-def test_backlash_loses_its_play_when_the_input_turns_round() -> None:
-    inputs = np.array([0.0, 1.0, 0.9, 0.5, -1.0])[:, None]
-    acting = ModelWithEffects(MODEL, (effects.Backlash((0.2,)),)).acting(inputs)[:, 0]
-    np.testing.assert_allclose(acting, [0.0, 0.8, 0.8, 0.7, -0.8])
-
-
 @pytest.mark.parametrize(
     ("effect", "acts"),
     [
@@ -66,51 +59,7 @@ def test_backlash_loses_its_play_when_the_input_turns_round() -> None:
     ],
 )
 def test_what_acts_of_inputs(effect: Effect, acts: list[float]) -> None:
-    np.testing.assert_allclose(effect.follow(np.array([2.0, -1.0]), None)[0], acts)
-
-
-@pytest.mark.parametrize(
-    "effect",
-    [
-        effects.SensorOffset((0.3,), 1),
-        effects.SensorScale((1.2,), (0, 2)),
-        effects.SwappedJoints((), (0, 2), (1, 3)),
-    ],
-)
-def test_states_are_found_again_in_what_is_recorded(effect: Effect) -> None:
-    x = np.random.default_rng(0).normal(size=(5, 4))
-    assert np.abs(effect.recorded(x) - x).max() > 0.1
-    np.testing.assert_allclose(effect.true(effect.recorded(x)), x, rtol=1e-12)
-
-
-def test_coulomb_friction_holds_at_rest_and_brakes_in_motion() -> None:
-    sticking = ModelWithEffects(MODEL, (effects.Coulomb((0.4,), **FORCE),))
-    x, u = np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0]]), np.array([[0.3], [0.0], [0.0]])
-    np.testing.assert_allclose(sticking.step(x, u)[:, 1], [0.0, 1.0 - 0.4 * DT, -1.0 + 0.4 * DT], atol=1e-12)
-
-
-def test_load_dependent_friction_grows_with_what_the_gears_carry() -> None:
-    friction = ModelWithEffects(MODEL, (effects.LoadFriction((0.5, 0.0), **FORCE, rates=(1,)),))
-    moving = np.array([[0.0, 10.0], [0.0, 10.0]])
-    lost = MODEL.step(moving, np.array([[1.0], [2.0]])) - friction.step(moving, np.array([[1.0], [2.0]]))
-    np.testing.assert_allclose(lost[:, 1], [0.5 * DT, 1.0 * DT], rtol=1e-6)
-
-
-def test_the_load_of_a_gear_is_that_of_its_own_motor() -> None:
-    # The second motor moves the first joint, too, and a weight of 3 pulls at it.
-    inverse = np.array([[2.0, -1.0], [-1.0, 3.0]])
-
-    def step(x: Array, u: Array) -> Array:
-        return x + DT * (u - np.array([3.0, 0.0])) @ inverse
-
-    joint = Joint(rate=0, input=0)
-    friction = effects.LoadFriction((0.5, 0.0), joint, 0.1, DT, rates=(0, 1))
-    model = models.Function(step, vectorized=True)
-    flow = Flow.of(model, np.zeros((2, 2)), np.array([[4.0, 0.0], [4.0, 9.0]]))
-    loads = friction.load(flow)
-    np.testing.assert_allclose(loads, [7.0, 7.0], rtol=1e-9)
-    lost = friction.load(Flow.of(model, np.array([[np.nan, 0.0], [0.0, 0.0]]), flow.inputs))
-    assert np.isfinite(lost).tolist() == [False, True]
+    np.testing.assert_allclose(effect.act(np.array([2.0, -1.0]), np.empty(0))[0], acts)
 
 
 def test_noise_of_measurements_acts_through_the_controller() -> None:

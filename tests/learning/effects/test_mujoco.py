@@ -53,4 +53,4 @@ def test_joints_and_units_are_those_of_the_model() -> None:
     (joint,) = plant.joints
     assert (joint.position, joint.rate, joint.input, joint.dof) == (0, 1, 0, 0)
     assert (plant.joint_name(joint), plant.force_unit(joint), plant.rate_unit(joint)) == ("hinge", "N m", "rad/s")
-    assert effects.InputGain((0.5,), 0).mjcf(plant) == '<motor name="motor" gear="0.5"/>'
+    assert effects.InputGain((0.5,), 0).repair(plant) == {"mjcf": '<motor name="motor" gear="0.5"/>'}

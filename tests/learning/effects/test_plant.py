@@ -64,5 +64,5 @@ def test_units_of_forces_are_those_of_inputs_or_of_accelerations() -> None:
 def test_slow_plants_are_late_by_seconds(dt: float, late: str, slow: str) -> None:
     x, u = np.linspace(-1, 1, 20)[:, None], np.ones((20, 1))
     plant = plant_of(models.Linear([[0.9]], [[0.1]]), dt, {"T": "degC"}, {"heat": "W"}, x, u)
-    assert f"arrive {late} late" in Delay((3.0,)).text(plant)
-    assert Lag((2.0,)).text(plant).endswith(f"of {slow}")
+    assert f"arrive {late} late" in Delay((3.0,)).sentence(plant)
+    assert Lag((2.0,)).sentence(plant).endswith(f"of {slow}")

@@ -46,12 +46,6 @@ ABOUT_DRAWS = (
 )
 """Assumptions and limits of the statements by independent draws among trials of any origin."""
 
-FROZEN = (
-    "the prediction was learned only from the model's own data and from trials before the first of these draws, and M "
-    "and the way of predicting were not changed after the draws were known"
-)
-"""The assumption that the prediction was fixed before the draws."""
-
 ANY_ORDER = "how the tasks were chosen and when the campaign stopped does not matter"
 
 
@@ -102,20 +96,6 @@ def violations(sample: Sample) -> str:
     return (
         f"{sample.failed} of {len(sample)} executions of independent draws have no distance and count as violations, "
         f"larger than any distance ({listed(numbers)})"
-    )
-
-
-def margin_and_map(
-    sample: Sample, margin: float, volume: float, total: float, confidence: float, limit: str, kept: str
-) -> str:
-    """Return the statement of a region: the margin of the prediction, and the share of the tasks above a limit."""
-    excess = f"exceeds the predicted one by at most {at_most(margin)}"
-    if margin < 0:
-        excess = f"is below the predicted one by at least {at_most(margin).removeprefix('-')}"
-    return (
-        f"With {percent(confidence)} confidence, the distance {excess}, except on at most {at_most(100 * volume, 3)} % "
-        f"{of_tasks(sample.distribution)}; {kept}, so that the distance exceeds {limit} on at most "
-        f"{at_most(100 * total, 3)} % in all."
     )
 
 

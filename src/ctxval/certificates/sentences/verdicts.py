@@ -280,13 +280,11 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
             return [f"the distance being as smooth between the trials as at them{where}", once]
         case "suite":
             return ["an execution of a task again giving the distance that was recorded"]
-        case "audit" | "anytime" | "scenario" | "sampling-discarding" | "region":
-            draws = (
+        case "audit" | "anytime" | "scenario" | "sampling-discarding":
+            return [
                 "tasks that were drawn independently, and from which M was not learned (how large the distance is in "
                 f"the {at_most(100 * certificate.volume, 3)} % that are left out is not known)"
-            )
-            fixed = "a prediction that was fixed before these tasks were drawn"
-            return [draws, fixed] if certificate.kind == "region" else [draws]
+            ]
     return ["what its certificate assumes"]
 
 
@@ -389,11 +387,5 @@ def _shortfall(certificate: Certificate) -> str:
             "or dynamics that depend on the task are the likely cause: record more states, state the task parameters "
             "that change the dynamics (physical = [...]), or use --kind posterior or an audit"
         )
-    outside, missing = "", details.get("not_counted")
-    if "share_kept" in details:
-        outside = (
-            f" ({at_most(100 * details['volume_of_draws'], 3)} % because of the number of draws, and the rest because "
-            "the prediction plus its margin exceeds the threshold there)"
-        )
-    left = f"; {missing} draws do not count, as their number was changed after they were known" if missing else ""
-    return f"{outside}{left}"
+    missing = details.get("not_counted")
+    return f"; {missing} draws do not count, as their number was changed after they were known" if missing else ""

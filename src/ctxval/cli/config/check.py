@@ -205,6 +205,9 @@ def _itself(validation: Validation, plans: Sequence[Plan]) -> Findings:
         where = task_text(validation.space.describe_point(early[0].parameters.points))
         end = f"after {early[0].model_trajectory.times[-1]:.3g} s"
         yield "noted", f"its closed loop ends early in {len(early)} of {len(plans)} tasks, such as {end} at {where}"
+    if falls := [plan for plan in plans if validation.falls(plan.model_trajectory)]:
+        where = task_text(validation.space.describe_point(falls[0].parameters.points))
+        yield "noted", f"its robot falls in {len(falls)} of {len(plans)} tasks, such as at {where}"
 
 
 def _batches(validation: Validation, plans: Sequence[Plan]) -> Findings:

@@ -16,7 +16,7 @@ from ctxval._util.refusals import reworded
 from ctxval._util.registry import Declaration, Registry, construct, declaration_of
 from ctxval.cli.config.references import accepts, is_function, reference, require_function, require_part
 from ctxval.core.model import Model
-from ctxval.core.task import Task
+from ctxval.core.task import COMMAND, Task
 from ctxval.core.task_distribution import Normal
 from ctxval.core.validation import Validation
 from ctxval.data import LogMapping, read_recordings
@@ -62,7 +62,9 @@ def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None, 
         if isinstance(file, str) and "<" not in file:  # "<" begins a MuJoCo model that is given as text
             placed[key] = str(Path(folder or "") / file)
     arguments = {
-        key: part(declared.parts[key], value, folder) if key in declared.parts else argument(value, folder)
+        key: part(declared.parts[key], value, folder)
+        if key in declared.parts and not (isinstance(value, Mapping) and "ref" in value)
+        else argument(value, folder)
         for key, value in placed.items()
     }
     for key, value in arguments.items():
@@ -152,18 +154,20 @@ def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any,
     """Return the map p -> task of an experiment file, from ``module:attr`` or from a table."""
     if isinstance(given, str):
         return require_function(f"the task {given}", reference(given, folder), "p -> Task")
-    require_known("entry of [task]", given, TaskTable.__dataclass_fields__)
+    require_known("entry of [task]", given, (*TaskTable.__dataclass_fields__, COMMAND))
     table = {"goal": None, "dt": getattr(system, "dt", None), **given}
     missing = [key for key in ("initial_state", "horizon", "dt") if table.get(key) is None]
     if missing:
         raise InputError(f"[task] needs {', '.join(missing)}.")
-    around = require("environment of [task]", Mapping, table.get("environment", {}))
+    around = dict(require("environment of [task]", Mapping, table.get("environment", {})))
+    if COMMAND in table:
+        around[COMMAND] = table.pop(COMMAND)
     of_environment = {f"environment {name!r}": entries for name, entries in around.items()}
     for name, entries in {"initial_state": table["initial_state"], "goal": table["goal"], **of_environment}.items():
         plain = type(entries) is list and entries and {*map(type, entries)} <= {int, float, str}
         if not plain and (name, entries) != ("goal", None):
             raise InputError(f"{name} of [task] must be a list of numbers and of names of parameters, got {entries!r}.")
-    task = TaskTable(**table)
+    task = TaskTable(**{**table, "environment": around})
     with reworded("[task] cannot be used"):
         task(space.parameters(space.low))
     return task

@@ -1,17 +1,16 @@
 """Effects that a model may lack: one dictionary for verdicts, causes and repair."""
 
 from ctxval.learning.effects.backlash import Backlash
-from ctxval.learning.effects.bias import Bias, InputOffset
+from ctxval.learning.effects.bias import Bias, InputDrift, InputOffset
 from ctxval.learning.effects.dead_zone import DeadZone
-from ctxval.learning.effects.effect import Effect
-from ctxval.learning.effects.friction import Coulomb, LoadFriction, Stribeck, Viscous
+from ctxval.learning.effects.effect import Effect, EffectCandidate, Parameter
+from ctxval.learning.effects.friction import Coulomb, FrictionAtRest, LoadFriction, Stribeck, Viscous
 from ctxval.learning.effects.gain import InputGain, ReversedInput, SwappedInputs
-from ctxval.learning.effects.gravity import Gravity
-from ctxval.learning.effects.inertia import Inertia
+from ctxval.learning.effects.inertia import Gravity, Inertia
 from ctxval.learning.effects.model import ModelWithEffects
 from ctxval.learning.effects.mujoco import BodyMass, JointAttribute, MassCentre
 from ctxval.learning.effects.plant import Joint
-from ctxval.learning.effects.saturation import Saturation
+from ctxval.learning.effects.saturation import RateLimit, Saturation
 from ctxval.learning.effects.sensor import SensorOffset, SensorScale, SwappedJoints, WrappedAngle
 from ctxval.learning.effects.time_step import TimeStep
 from ctxval.learning.effects.transport import Delay, Lag, ObservationDelay
@@ -24,8 +23,11 @@ __all__ = [
     "DeadZone",
     "Delay",
     "Effect",
+    "EffectCandidate",
+    "FrictionAtRest",
     "Gravity",
     "Inertia",
+    "InputDrift",
     "InputGain",
     "InputOffset",
     "Joint",
@@ -35,6 +37,8 @@ __all__ = [
     "MassCentre",
     "ModelWithEffects",
     "ObservationDelay",
+    "Parameter",
+    "RateLimit",
     "ReversedInput",
     "Saturation",
     "SensorOffset",

@@ -6,9 +6,10 @@ act for those that are commanded, the next state, or what is recorded of a state
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,38 +18,75 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
 from ctxval.learning.effects.flow import Flow
-from ctxval.learning.effects.plant import Plant
+from ctxval.learning.effects.plant import Joint, Plant, drive
+
+Size = float | Array
+"""A number, or a number of each draw ``(S, 1)``, which broadcasts to one value for each draw and task ``(S, q)``."""
 
 
 @dataclass(frozen=True)
 class Effect(ShortRepr):
-    """Something that a model lacks, with sizes in physical units. A subclass changes one of the hooks, for batches."""
+    """Something that a model lacks, with sizes in physical units. A subclass changes one of the hooks, for batches.
 
-    sizes: tuple[float, ...]
+    If sizes are arrays, states ``(S, q, n)`` and inputs ``(S, q, m)`` have the draws as their first axis.
+    """
+
+    sizes: tuple[Size, ...]
     name: ClassVar[str]  #: what it is in two or three words
-    remembers: ClassVar[bool] = False  #: whether inputs that act depend on earlier ones, so that no step has it
 
-    def with_sizes(self, sizes: Sequence[float]) -> Effect:
+    @classmethod
+    def candidates(cls, observed: Observed) -> Iterable[EffectCandidate]:
+        """Return the effects of this kind that recorded executions may have."""
+        return ()
+
+    def with_sizes(self, sizes: Sequence[Size]) -> Effect:
         """Return the effect with other sizes."""
-        return replace(self, sizes=tuple(float(size) for size in sizes))
+        return replace(self, sizes=tuple(size if isinstance(size, np.ndarray) else float(size) for size in sizes))
 
     @property
     def kind(self) -> Effect:
         """The effect without its sizes: two effects of one kind are one effect."""
         return replace(self, sizes=())
 
-    def model(self, model: Model) -> Model:
-        """Return the model of the mechanics."""
-        return model
+    def remembered(self, inputs: int) -> int:
+        """Return the number of values that it remembers of so many inputs; all are 0 before the first step."""
+        return 0
 
-    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        """Return the inputs that act ``(..., m)`` for those of effects before, and a memory; None at the first step.
+    @property
+    def remembers(self) -> bool:
+        """Whether what acts depends on earlier steps, so that no single step has the effect."""
+        return self.remembered(1) > 0
+
+    @property
+    def in_parts(self) -> bool:
+        """Whether inputs that act change while a step goes on."""
+        return False
+
+    def act(self, u: Array, memory: Array) -> tuple[Array, Array]:
+        """Return the inputs that act ``(..., m)`` for those of effects before, and the new memory ``(..., k)``.
 
         If they change while a step goes on, they are those of its parts ``(..., parts, m)``.
         """
         return u, memory
 
-    def duration(self, model: Model) -> float:
+    def acting(self, inputs: Array) -> Array:
+        """Return the inputs that act in each step, for commanded ones ``(..., H, m)``."""
+        commands = np.moveaxis(inputs, -2, 0)
+        if self.remembers:
+            memory, steps = np.zeros((*commands.shape[1:-1], self.remembered(inputs.shape[-1]))), []
+            for u in commands:
+                acting, memory = self.act(u, memory)
+                steps.append(acting)
+            together = np.stack(steps)
+        else:
+            together = self.act(commands, np.empty((*commands.shape[:-1], 0)))[0]
+        return np.moveaxis(together, 0, inputs.ndim - 2)
+
+    def model(self, model: Model) -> Model:
+        """Return the model of the mechanics. If it differs in its draws, sizes are numbers here."""
+        return model
+
+    def duration(self, model: Model) -> Size:
         """Return the steps of a model of the mechanics that a step of the system takes."""
         return 1.0
 
@@ -72,70 +110,127 @@ class Effect(ShortRepr):
         """Return differences of recorded states ``(..., n)`` as they are to be compared."""
         return difference
 
-    def text(self, plant: Plant) -> str:
+    def sentence(self, plant: Plant) -> str:
         """Return what it is with its sizes and units: a clause without a full stop."""
         raise NotImplementedError
 
     def python(self) -> str:
         """Return the Python expression that makes it."""
-        given = [f"{name}={value!r}" for name, value in vars(self).items() if name != "sizes"]
+        fields = [(name, value) for name, value in vars(self).items() if name != "sizes"]
+        given = [f"{name}={value:.6g}" if isinstance(value, float) else f"{name}={value!r}" for name, value in fields]
         sizes = f"({', '.join(f'{size:.6g}' for size in self.sizes)}{',' if len(self.sizes) == 1 else ''})"
         text = f"causes.{type(self).__name__}({', '.join([sizes, *given])})"
         return text.replace("Joint(rate", "causes.Joint(rate")
 
-    def mjcf(self, plant: Plant) -> str | None:
-        """Return the line of MJCF that puts it into a MuJoCo model; None if there is none."""
-        return None
+    def repair(self, plant: Plant) -> dict[str, str]:
+        """Return the lines that put it into a robot's description, by language: ``mjcf``, ``urdf``; none if empty."""
+        return {}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A size to be learned. Its prior is uniform between its bounds."""
+
+    name: str
+    low: float
+    high: float
+    scale: float  #: a change that matters, for the steps of fits and of chains
+    unit: str = ""
 
 
 @dataclass(frozen=True)
 class EffectCandidate(ShortRepr):
-    """An effect whose sizes are to be fitted."""
+    """An effect whose sizes are to be learned."""
 
     effect: Effect
-    low: tuple[float, ...] = ()  #: bounds of the sizes
-    high: tuple[float, ...] = ()
-    scales: tuple[float, ...] = ()  #: changes of the sizes that matter, for the steps of the fit
-    starts: tuple[tuple[float, ...], ...] = ((),)  #: first guesses, of which the best one is refined
+    parameters: tuple[Parameter, ...] = ()  #: one for each size
+    starts: tuple[tuple[float, ...], ...] = ((),)  #: first guesses of all sizes
 
 
-def of_size(effect: Effect, low: float, high: float, scale: float, *starts: float) -> EffectCandidate:
+def of_size(effect: Effect, parameter: Parameter, *starts: float) -> EffectCandidate:
     """Return a candidate with one size."""
-    return EffectCandidate(effect, (low,), (high,), (scale,), tuple((start,) for start in starts))
+    return EffectCandidate(effect, (parameter,), tuple((start,) for start in starts))
 
 
 def of_ratio(effect: Effect) -> EffectCandidate:
     """Return a candidate whose size is a ratio."""
-    return of_size(effect, 0.1, 10.0, 0.1, 0.95, 1.1)
+    return of_size(effect, Parameter(effect.name, 0.1, 10.0, 0.1), 0.95, 1.1)
+
+
+@dataclass(frozen=True, eq=False)
+class Observed(ShortRepr):
+    """Recorded transitions, from which candidates have their bounds and first guesses."""
+
+    plant: Plant
+    x: Array  #: states ``(N, n)``
+    u: Array  #: inputs ``(N, m)``
+    missed: Array  #: root mean squares of the residuals of M ``(n,)``
+    seconds: float  #: of the longest execution
+    estimated: bool  #: whether states are estimated from outputs, so that they have no sensors
+
+    @functools.cached_property
+    def forces(self) -> tuple[tuple[Joint, float, float], ...]:
+        """Where forces may enter, each with the force that makes what M misses of the rate, and with a usual rate."""
+        found = []
+        rows = slice(None, None, max(1, len(self.x) // 50))
+        flow = Flow.of(self.plant.model, self.x[rows], self.u[rows])
+        for joint in self.plant.ports:
+            probe = 1.0 if joint.input is None or joint.dof is not None else 0.1 * self.plant.commanded[joint.input]
+            changes = drive(flow, joint, float(probe), self.plant.dt)[:, joint.rate]
+            changes = changes[np.isfinite(changes)]
+            size = float(np.sqrt((changes**2).mean())) if len(changes) else 0.0
+            speed = float(np.sqrt((self.x[:, joint.rate] ** 2).mean()))
+            if size > 0 and speed > 0 and self.missed[joint.rate] > 0:
+                found.append((joint, float(self.missed[joint.rate]) / size, speed))
+        return tuple(found)
 
 
 @dataclass(frozen=True)
 class OfInput(Effect):
-    """An effect in one input. A subclass has the formula of what acts, and the sentence."""
+    """An effect in one input. A subclass has the formula of what acts, and the words."""
 
     input: int = 0
-    sentence: ClassVar[str]  #: with the ``name`` and ``unit`` of the input and the ``size``; ``play`` is twice the size
+    holds: ClassVar[bool] = False  #: whether what acts depends on what acted before
+    words: ClassVar[str]  #: with the ``name`` and ``unit`` of the input and the ``size``; ``play`` is twice the size
+
+    @classmethod
+    def candidates(cls, observed: Observed) -> Iterator[EffectCandidate]:
+        for k, most in enumerate(observed.plant.commanded.tolist()):
+            yield cls.of_input(k, most, observed)
+
+    @classmethod
+    def of_input(cls, k: int, most: float, observed: Observed) -> EffectCandidate:
+        """Return the candidate of an input, whose largest magnitude is given."""
+        raise NotImplementedError
+
+    def remembered(self, inputs: int) -> int:
+        return int(self.holds)
 
     def acts(self, u: Array, before: Array) -> Array:
         """Return what acts ``(...)`` for what is commanded of the input, and what acted before, 0 at first."""
         raise NotImplementedError
 
-    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
+    def act(self, u: Array, memory: Array) -> tuple[Array, Array]:
         acting = np.array(u, dtype=np.float64)
-        before = np.zeros_like(acting) if memory is None else memory
-        acting[..., self.input] = self.acts(acting[..., self.input], before[..., self.input])
-        return acting, acting if self.remembers else None
+        now = self.acts(u[..., self.input], memory[..., 0] if self.holds else u[..., self.input])
+        acting[..., self.input] = now
+        return acting, now[..., None] if self.holds else memory
 
-    def text(self, plant: Plant) -> str:
+    def sentence(self, plant: Plant) -> str:
         (name, unit), (size,) = plant.inputs[self.input], self.sizes or (0.0,)
-        return self.sentence.format(name=name, unit=unit, size=size, play=2 * size).rstrip()
+        return self.words.format(name=name, unit=unit, size=size, play=2 * size).rstrip()
 
 
-def at_index(values: Array, index: int | list[int] | None, size: float, elsewhere: float = 0.0) -> Array:
+def at_index(values: Array, index: int | list[int] | None, size: Size, elsewhere: float = 0.0) -> Array:
     """Return an array of the last axis of values with a size at some places, or everywhere if the index is None."""
-    sizes = np.full(values.shape[-1], elsewhere)
-    sizes[slice(None) if index is None else index] = size
+    sizes = np.full((*np.shape(size), values.shape[-1]), elsewhere)
+    sizes[..., slice(None) if index is None else np.atleast_1d(index)] = beside(size)
     return sizes
+
+
+def beside(size: Size, axes: int = 1) -> Array:
+    """Return a size with more axes at its end, as a factor of vectors or matrices."""
+    return np.reshape(size, (*np.shape(size), *[1] * axes))
 
 
 def seconds_text(seconds: float) -> str:

@@ -16,6 +16,7 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.learning.effects.effect import Effect, EffectCandidate
 from ctxval.learning.effects.flow import Linearisation
 from ctxval.learning.effects.model import ModelWithEffects
+from ctxval.models import MuJoCo
 
 
 @dataclass(frozen=True)
@@ -100,14 +101,19 @@ class Segments:
             return Linearisation.of(self.model, self.states, inputs[np.minimum(np.concatenate(rows), len(inputs) - 1)])
 
     def left_by(self, repaired: ModelWithEffects, window: Predictions, moved: Array | float = 0.0) -> Array:
-        """Return predicted minus recorded states ``(N, n)``; predictions begin at recorded states that are moved."""
-        acting = repaired.acting(self.inputs)
-        acting = acting.reshape(-1, *acting.shape[2:])
-        x = repaired.true(self.states[window.states] + moved)
+        """Return predicted minus recorded states ``(N, n)``, of draws ``(S, N, n)``.
+
+        Predictions begin at recorded states that are moved.
+        """
+        draws = (repaired.draws,) if repaired.draws else ()
+        acting = repaired.acting(np.broadcast_to(self.inputs, (*draws, *self.inputs.shape)))
+        acting = acting.reshape(*draws, -1, *acting.shape[len(draws) + 2 :])
+        begun = self.states[window.states] + moved
+        x = repaired.true(np.broadcast_to(begun, (*draws, *begun.shape)))
         moved_back = any(type(effect).true is not Effect.true for effect in repaired.effects)
         for k in range(window.steps):
             at = None if moved_back else self.linearised[window.states + k]
-            x = repaired.reached(x, acting[window.inputs + k], at)
+            x = repaired.reached(x, acting.take(window.inputs + k, axis=len(draws)), at)
         return self._gap(repaired.recorded(x) - self.states[window.states + window.steps])
 
     def _gap(self, difference: Array) -> Array:
@@ -193,7 +199,7 @@ class Explanation(ShortRepr):
     @property
     def sizes(self) -> list[float]:
         """The sizes of all effects."""
-        return [size for effect in self.repaired.effects for size in effect.sizes]
+        return [float(size) for effect in self.repaired.effects for size in effect.sizes]
 
 
 def explained(
@@ -233,10 +239,9 @@ def screened(segments: Segments, candidates: tuple[EffectCandidate, ...]) -> tup
     results = []
     for start in candidates[-1].starts:
         theta = np.array([*known, *start])
-        here = fit.errors(theta, segments.sizes)
+        here, J = fit.slope(theta, segments.sizes)
         linear, moved = here, theta
         if len(theta):
-            J = fit.slope(theta, segments.sizes, here)
             moved = np.clip(theta + np.linalg.lstsq(J, -here, rcond=1e-8)[0], fit.low, fit.high)
             linear = here + J @ (moved - theta)
         results.append((fit.misfit(linear) + fit.penalty, moved))
@@ -248,39 +253,41 @@ class _Fit:
 
     def __init__(self, segments: Segments, candidates: tuple[EffectCandidate, ...]) -> None:
         self.segments, self.candidates = segments, candidates
+        parameters = [parameter for each in candidates for parameter in each.parameters]
         self.low, self.high, self.scales = (
-            np.array([value for each in candidates for value in getattr(each, name)])
-            for name in ("low", "high", "scales")
+            np.array([getattr(parameter, name) for parameter in parameters]) for name in ("low", "high", "scale")
         )
         # Which effect it is counts like a size.
         self.penalty = (len(self.scales) + len(candidates)) * float(np.log(len(segments.windows[0].states)))
 
     def repaired(self, theta: Array) -> ModelWithEffects:
-        sizes = iter(theta.tolist())
-        effects = (each.effect.with_sizes([next(sizes) for _ in each.scales]) for each in self.candidates)
-        return ModelWithEffects(self.segments.model, tuple(effects))
+        """Return M with effects of sizes ``(p,)``, or with those of draws ``(S, p)``."""
+        sizes = iter(theta.tolist() if theta.ndim == 1 else theta.T[:, :, None])
+        effects = (each.effect.with_sizes([next(sizes) for _ in each.parameters]) for each in self.candidates)
+        return ModelWithEffects(self.segments.model, tuple(effects), self.segments.inputs.shape[-1])
 
     def errors(self, theta: Array, sizes: Sequence[Array]) -> Array:
-        """Return residuals in given sizes, whose squares are means over the predictions of each window."""
+        """Return residuals ``(R,)`` in given sizes, or ``(S, R)``; their squares are means over each window."""
         model, parts = self.repaired(theta), []
         for window, size in zip(self.segments.windows, sizes, strict=True):
             left = self.segments.limited(self.segments.left_by(model, window) / size)
-            parts.append(left.ravel() / np.sqrt(len(left)))
-        return np.concatenate(parts)
+            parts.append(left.reshape(*theta.shape[:-1], -1) / np.sqrt(len(window.states)))
+        return np.concatenate(parts, axis=-1)
 
-    def slope(self, theta: Array, sizes: Sequence[Array], here: Array) -> Array:
-        columns = []
-        for i, step in enumerate(1e-3 * self.scales):
-            moved = theta.copy()
-            moved[i] += step if moved[i] + step <= self.high[i] else -step
-            columns.append((self.errors(moved, sizes) - here) / (moved[i] - theta[i]))
-        return np.stack(columns, axis=1)
+    def slope(self, theta: Array, sizes: Sequence[Array]) -> tuple[Array, Array]:
+        """Return residuals ``(R,)`` and their derivatives ``(R, p)``."""
+        steps = 1e-3 * np.where(theta + 1e-3 * self.scales <= self.high, self.scales, -self.scales)
+        moved = theta + np.concatenate([np.zeros((1, len(theta))), np.diag(steps)])
+        if isinstance(self.segments.model, MuJoCo) or not len(theta):  # its draws run one after the other in any case
+            errors = np.stack([self.errors(each, sizes) for each in moved])
+        else:
+            errors = self.errors(moved, sizes)
+        return errors[0], (errors[1:] - errors[0]).T / steps
 
     def most_likely_of_states(self, theta: Array) -> Array:
         """Return the most likely of these sizes and of those that explain one state alone, by a Gauss-Newton step."""
         # Where M integrates a position otherwise than the system does, an effect explains the rate alone.
-        here, n = self.errors(theta, self.segments.sizes), len(self.segments.sizes[0])
-        J, tried = self.slope(theta, self.segments.sizes, here), [theta]
+        (here, J), n, tried = self.slope(theta, self.segments.sizes), len(self.segments.sizes[0]), [theta]
         for i in range(n):  # rows of errors are predictions after predictions, each with all states
             step = np.linalg.lstsq(J[i::n], -here[i::n], rcond=1e-8)[0]
             tried.append(np.clip(theta + step, self.low, self.high))
@@ -301,19 +308,12 @@ class _Fit:
 
     def best(self, start: Array, sizes: Sequence[Array], evaluations: int) -> Array:
         inside = np.clip(start, self.low + 1e-9 * self.scales, self.high - 1e-9 * self.scales)
-        known: dict[bytes, Array] = {}
-
-        def errors(theta: Array) -> Array:
-            known.clear()
-            here = known[theta.tobytes()] = self.errors(theta, sizes)
-            return here
-
-        def slope(theta: Array) -> Array:
-            here = known.get(theta.tobytes())
-            return self.slope(theta, sizes, self.errors(theta, sizes) if here is None else here)
-
         bounds, options = (self.low, self.high), {"max_nfev": evaluations, "xtol": 1e-4, "ftol": 1e-5}
-        return np.asarray(least_squares(errors, inside, slope, bounds=bounds, x_scale=self.scales, **options).x)
+        fitted = least_squares(
+            lambda theta: self.errors(theta, sizes), inside, lambda theta: self.slope(theta, sizes)[1],
+            bounds=bounds, x_scale=self.scales, **options,
+        )  # fmt: skip
+        return np.asarray(fitted.x)
 
 
 def _size(errors: Array) -> Array:

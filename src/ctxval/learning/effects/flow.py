@@ -19,9 +19,9 @@ from ctxval.models import MuJoCo
 
 PARTS = 8  #: of a step, a power of 2
 
-Push = tuple[Array, int, Callable[[Array, Array], Array]]
+Push = tuple[Array, int, Callable[[Array, Array, Array], Array]]
 """The change of the state by a unit of a force in a step ``(..., n)``, the state that is its rate, and the force
-``(rate, stopping) -> (...)`` at a rate, where ``stopping`` would let the rate end at 0."""
+``(before, rate, stopping) -> (...)`` at a rate and its mean, where ``stopping`` would let the rate end at 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,10 @@ class Linearisation(ShortRepr):
         held, grown = moved, unit + A @ moved
         for _ in range(PARTS.bit_length() - 1):
             held, grown = held + grown @ held, grown @ grown
-        return cls(A, np.asarray(np.linalg.inv(held), dtype=np.float64))
+        driven = _inverse(held)
+        # In states of a loop that diverged, a step may have no flow but a straight line.
+        flows = (np.abs(held @ driven - unit) < 1e-6).all(axis=(-2, -1), keepdims=True)
+        return cls(np.where(flows, A, 0.0), np.where(flows, driven, unit))
 
     def __getitem__(self, rows: Rows) -> Linearisation:
         """Return that at some of the states; a linear model has the same everywhere."""
@@ -89,36 +92,49 @@ class Flow(ShortRepr):
             across = np.diff(np.asarray(model.step(*map(np.array, paired(x[..., None, :], ends)))), axis=-2)
             line = np.diff(ends, axis=-2)
             along = ((u - mean[..., None, :]) * line).sum(axis=-1) / np.maximum((line**2).sum(axis=-1), 1e-300)
-            varied = np.moveaxis(along[..., None] * _times(at.driven[..., None, :, :], across), -2, 0)
-        return cls(model, x, mean, at, at.A, _times(at.driven, reached - x), reached, varied)
+            varied = np.moveaxis(along[..., None] * times(at.driven[..., None, :, :], across), -2, 0)
+        return cls(model, x, mean, at, at.A, times(at.driven, reached - x), reached, varied)
 
     def driven(self, change: Array) -> Array:
         """Return the d ``(..., n)`` that is held and makes a change of the state in a step of M."""
-        return _times(self.at.driven, change)
+        return times(self.at.driven, change)
 
-    def end(self, duration: float = 1.0) -> Array:
-        """Return the state ``(..., n)`` after a part of a step of M."""
+    def end(self, duration: float | Array = 1.0) -> Array:
+        """Return the state ``(..., n)`` after a part of a step of M, a number or one of each draw ``(S, 1)``."""
         moved = _moved(self.A, duration / PARTS)
-        effects = [(_times(moved, push), rate, force) for push, rate, force in self.pushes]
+        effects = [(times(moved, push), rate, force) for push, rate, force in self.pushes]
         x = self.start
         for varied in self.varied:
-            reached = x + _times(moved, self.d + varied + _times(self.A, x - self.start))
+            reached = x + times(moved, self.d + varied + times(self.A, x - self.start))
             for effect, rate, force in effects:
                 moving = np.where(np.abs(effect[..., rate]) > 1e-12, effect[..., rate], 1e-12)
-                size = force(0.5 * (x[..., rate] + reached[..., rate]), -reached[..., rate] / moving)
+                mean = 0.5 * (x[..., rate] + reached[..., rate])
+                size = force(x[..., rate], mean, -reached[..., rate] / moving)
                 reached = reached + effect * size[..., None]
             x = reached
         return x
 
 
-def _times(matrix: Array, vector: Array) -> Array:
+def times(matrix: Array, vector: Array) -> Array:
+    """Return the products of matrices ``(..., n, k)`` and vectors ``(..., k)``."""
     return np.asarray((matrix @ vector[..., None])[..., 0])
 
 
-def _moved(A: Array, h: float) -> Array:
+def _moved(A: Array, h: float | Array) -> Array:
     """Return the change of the state by a unit of its derivative, in a part h of a step: the Pade approximation."""
+    h = np.asarray(h)[..., None, None]
     z, unit = h * A, np.eye(A.shape[-1])
-    return np.asarray(h * np.linalg.inv(unit - z / 2 + z @ z / 12))
+    return h * _inverse(unit - z / 2 + z @ z / 12)
+
+
+def _inverse(matrices: Array) -> Array:
+    """Return the inverses of matrices ``(..., n, n)``; NaN if one has none."""
+    try:
+        return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        regular = (np.abs(np.linalg.slogdet(matrices).sign) > 0)[..., None, None]
+        inverses = np.linalg.inv(np.where(regular, matrices, np.eye(matrices.shape[-1])))
+        return np.where(regular, inverses, np.nan)
 
 
 def logarithm(J: Array) -> Array:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.learning.effects.effect import Effect
+from ctxval.learning.effects.effect import Effect, EffectCandidate, Observed, Parameter
 from ctxval.learning.effects.flow import Flow
-from ctxval.learning.effects.plant import Joint, Plant
+from ctxval.learning.effects.plant import Joint, Plant, drive
 
 
 @dataclass(frozen=True)
@@ -21,21 +22,27 @@ class Force(Effect):
     probe: float = 1.0  #: a force that is typical of the joint, with which its effect in M is measured
     dt: float = 1.0  #: seconds
 
+    @classmethod
+    def candidates(cls, observed: Observed) -> Iterator[EffectCandidate]:
+        for joint, force, speed in observed.forces:
+            yield from cls.on_joint(observed, (joint, 0.1 * force, observed.plant.dt), force, speed)
+
+    @classmethod
+    def on_joint(
+        cls, observed: Observed, where: tuple[Joint, float, float], force: float, speed: float
+    ) -> Iterator[EffectCandidate]:
+        """Yield the candidates at a joint for a typical force and rate; ``where`` are the fields after the sizes."""
+        raise NotImplementedError
+
     def drive(self, flow: Flow) -> Array:
         """Return the change of the state by one unit of the force in a step of M, in units of ``flow.d``."""
-        model, x, u = flow.model, flow.start, flow.inputs
-        if self.joint.dof is not None:  # of a model of MuJoCo
-            forces = self.probe * np.eye(model.compiled.nv)[self.joint.dof]  # type: ignore[attr-defined]
-            pushed = model.changed(forces=forces).step(x, u)  # type: ignore[attr-defined]
-            return flow.driven((pushed - flow.reached) / self.probe)
-        if self.joint.input is not None:
-            moved = u + self.probe * np.eye(u.shape[-1])[self.joint.input]
-            return flow.driven((np.asarray(model.step(x, moved)) - flow.reached) / self.probe)
-        accelerated = accelerations(x.shape[-1], [self.joint], self.dt)[:, self.joint.rate]
-        return np.broadcast_to(self.dt * accelerated, x.shape)
+        return drive(flow, self.joint, self.probe, self.dt)
 
-    def force(self, rate: Array, load: Array | float, stopping: Array) -> Array:
-        """Return the force ``(...)`` at a rate, a load of the gears, and a force that would stop the joint."""
+    def force(self, before: Array, rate: Array, load: Array | float, stopping: Array) -> Array:
+        """Return the force ``(...)`` in a part of a step, which would let the joint stop if it were ``stopping``.
+
+        The arguments are the rate before the part, its mean if no force acted, and the load of the gears.
+        """
         raise NotImplementedError
 
     def load(self, flow: Flow) -> Array | float:
@@ -44,18 +51,22 @@ class Force(Effect):
 
     def within(self, flow: Flow) -> Flow:
         load = self.load(flow)
-        push = self.drive(flow), self.joint.rate, lambda rate, stopping: self.force(rate, load, stopping)
-        return replace(flow, pushes=(*flow.pushes, push))
 
-    def amount(self, plant: Plant, size: float) -> str:
+        def force(before: Array, rate: Array, stopping: Array) -> Array:
+            return self.force(before, rate, load, stopping)
+
+        return replace(flow, pushes=(*flow.pushes, (self.drive(flow), self.joint.rate, force)))
+
+    def amount(self, plant: Plant, size: Any) -> str:
+        """Return a force with its unit."""
         return f"{size:.3g} {plant.force_unit(self.joint)}"
 
 
-def accelerations(n: int, joints: Sequence[Joint], dt: float) -> Array:
-    """Return the part ``(n, n)`` of derivatives that accelerations of joints make, as M integrates."""
-    part = np.zeros((n, n))
-    for joint in joints:
-        part[joint.rate, joint.rate] = 1.0
-        if joint.position is not None:
-            part[joint.position, joint.rate] = (joint.share - 0.5) * dt
-    return part
+def force_parameter(observed: Observed, joint: Joint, name: str, force: float, *, both: bool = False) -> Parameter:
+    """Return the parameter of a force on a joint, which may have ``both`` signs, for a typical one."""
+    return Parameter(name, -20 * force if both else 0.0, 20 * force, 0.1 * force, observed.plant.force_unit(joint))
+
+
+def limited(stopping: Array, most: Any) -> Array:
+    """Return the force of friction that stops a joint if it can, ``(...)``."""
+    return np.clip(stopping, -most, most)

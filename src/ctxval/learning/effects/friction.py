@@ -1,16 +1,20 @@
-"""Friction of joints: viscous, Coulomb, Stribeck and load-dependent."""
+"""Friction of joints: viscous, Coulomb, at rest, Stribeck and load-dependent."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
-from ctxval.learning.effects.flow import Flow
-from ctxval.learning.effects.force import Force
-from ctxval.learning.effects.plant import Plant
+from ctxval.learning.effects.effect import EffectCandidate, Observed, Parameter, beside, of_size
+from ctxval.learning.effects.flow import Flow, times
+from ctxval.learning.effects.force import Force, force_parameter, limited
+from ctxval.learning.effects.plant import Joint, Plant
+
+Where = tuple[Joint, float, float]
 
 
 @dataclass(frozen=True)
@@ -19,13 +23,21 @@ class Viscous(Force):
 
     name: ClassVar[str] = "viscous friction"
 
+    @classmethod
+    def on_joint(cls, observed: Observed, where: Where, force: float, speed: float) -> Iterator[EffectCandidate]:
+        if where[0].dof is None:  # otherwise it is an attribute of the joint
+            slope, joint = force / speed, where[0]
+            rate = observed.plant.rate_unit(joint)
+            unit = observed.plant.force_unit(joint) + (f" per {rate}" if rate else "")
+            yield of_size(cls((0.0,), *where), Parameter(cls.name, -20 * slope, 20 * slope, 0.1 * slope, unit), 0.0)
+
     def within(self, flow: Flow) -> Flow:
-        drive, rate = self.sizes[0] * self.drive(flow), self.joint.rate
+        drive, rate = beside(self.sizes[0]) * self.drive(flow), self.joint.rate
         A = np.array(np.broadcast_to(flow.A, (*drive.shape, drive.shape[-1])))
         A[..., rate] -= drive
         return replace(flow, A=A, d=flow.d - drive * flow.start[..., rate, None])
 
-    def text(self, plant: Plant) -> str:
+    def sentence(self, plant: Plant) -> str:
         rate, more = plant.rate_unit(self.joint), "more" if self.sizes[0] >= 0 else "less"
         size = self.amount(plant, abs(self.sizes[0])) + (f" per {rate}" if rate else "")
         return f"{plant.joint_name(self.joint)} has {more} viscous friction than M ({size})"
@@ -37,11 +49,43 @@ class Coulomb(Force):
 
     name: ClassVar[str] = "Coulomb friction"
 
-    def force(self, rate: Array, load: Array | float, stopping: Array) -> Array:
-        return np.clip(stopping, -self.sizes[0], self.sizes[0])
+    @classmethod
+    def on_joint(cls, observed: Observed, where: Where, force: float, speed: float) -> Iterator[EffectCandidate]:
+        if where[0].dof is None:
+            size = force_parameter(observed, where[0], cls.name, force)
+            yield of_size(cls((0.0,), *where), size, 0.3 * force, force)
 
-    def text(self, plant: Plant) -> str:
+    def force(self, before: Array, rate: Array, load: Array | float, stopping: Array) -> Array:
+        return limited(stopping, self.sizes[0])
+
+    def sentence(self, plant: Plant) -> str:
         return f"{plant.joint_name(self.joint)} sticks ({self.amount(plant, self.sizes[0])})"
+
+
+@dataclass(frozen=True)
+class FrictionAtRest(Force):
+    """Coulomb friction that is larger at rest alone. Sizes: in motion, and what is added at rest.
+
+    A joint leaves rest if more acts on it than both together (Karnopp, "Computer simulation of stick-slip friction in
+    mechanical dynamic systems", ASME Journal of Dynamic Systems, Measurement, and Control 107, 1985).
+    """
+
+    name: ClassVar[str] = "friction at rest"
+    still: float = 0.0  #: the largest rate of a joint at rest
+
+    @classmethod
+    def on_joint(cls, observed: Observed, where: Where, force: float, speed: float) -> Iterator[EffectCandidate]:
+        sliding, added = (force_parameter(observed, where[0], name, force) for name in ("sliding", "added at rest"))
+        starts = ((0.5 * force, 0.3 * force), (0.3 * force, force))
+        yield EffectCandidate(cls((0.0, 0.0), *where, 1e-3 * speed), (sliding, added), starts)
+
+    def force(self, before: Array, rate: Array, load: Array | float, stopping: Array) -> Array:
+        sliding, added = self.sizes
+        return limited(stopping, sliding + np.where(np.abs(before) <= self.still, added, 0.0))
+
+    def sentence(self, plant: Plant) -> str:
+        sliding, added = (self.amount(plant, size) for size in (self.sizes[0], sum(self.sizes)))
+        return f"{plant.joint_name(self.joint)} sticks more at rest ({added}) than in motion ({sliding})"
 
 
 @dataclass(frozen=True)
@@ -54,12 +98,18 @@ class Stribeck(Force):
 
     name: ClassVar[str] = "Stribeck friction"
 
-    def force(self, rate: Array, load: Array | float, stopping: Array) -> Array:
-        sliding, added, slow = self.sizes
-        most = sliding + added * np.exp(-((rate / max(slow, 1e-12)) ** 2))
-        return np.clip(stopping, -most, most)
+    @classmethod
+    def on_joint(cls, observed: Observed, where: Where, force: float, speed: float) -> Iterator[EffectCandidate]:
+        sliding, added = (force_parameter(observed, where[0], name, force) for name in ("sliding", "added at rest"))
+        slow = Parameter("slow rate", 0.01 * speed, 2 * speed, 0.1 * speed, observed.plant.rate_unit(where[0]))
+        starts = ((0.5 * force, 0.5 * force, 0.3 * speed), (0.7 * force, 0.3 * force, 0.1 * speed))
+        yield EffectCandidate(cls((0.0, 0.0, 1.0), *where), (sliding, added, slow), starts)
 
-    def text(self, plant: Plant) -> str:
+    def force(self, before: Array, rate: Array, load: Array | float, stopping: Array) -> Array:
+        sliding, added, slow = self.sizes
+        return limited(stopping, sliding + added * np.exp(-((rate / np.maximum(slow, 1e-12)) ** 2)))
+
+    def sentence(self, plant: Plant) -> str:
         sliding, added, slow = self.sizes
         name, rate = plant.joint_name(self.joint), plant.rate_unit(self.joint)
         sizes = f"{self.amount(plant, sliding + added)} at rest, {self.amount(plant, sliding)} above {slow:.3g} {rate}"
@@ -75,6 +125,13 @@ class LoadFriction(Force):
 
     name: ClassVar[str] = "load-dependent friction"
     rates: tuple[int, ...] = ()  #: the rates of all joints that inputs drive
+
+    @classmethod
+    def on_joint(cls, observed: Observed, where: Where, force: float, speed: float) -> Iterator[EffectCandidate]:
+        rates = tuple(dict.fromkeys(port.rate for port in observed.plant.ports if port.input is not None))
+        share = Parameter("share of the load", 0.0, 2.0, 0.05)
+        sizes = share, force_parameter(observed, where[0], "without load", force)
+        yield EffectCandidate(cls((0.0, 0.0), *where, rates), sizes, ((0.05, 0.0), (0.2, 0.3 * force)))
 
     def load(self, flow: Flow) -> Array:
         model, x, u = flow.model, flow.start, flow.inputs
@@ -98,14 +155,13 @@ class LoadFriction(Force):
         moved = (np.asarray(model.step(x, np.zeros_like(u) + each)) for each in probes)
         effects = np.stack([flow.driven(each - resting)[..., rates] / self.probe for each in moved], axis=-1)
         effects = np.nan_to_num(effects, nan=0.0, posinf=0.0, neginf=0.0)  # a step of M may have failed
-        pulls = u - (np.linalg.pinv(effects) @ pulled[..., rates, None])[..., 0]
+        pulls = u - times(np.asarray(np.linalg.pinv(effects), dtype=np.float64), pulled[..., rates])
         return np.asarray(np.abs(pulls[..., self.joint.input]))
 
-    def force(self, rate: Array, load: Array | float, stopping: Array) -> Array:
-        most = self.sizes[0] * load + self.sizes[1]
-        return np.clip(stopping, -most, most)
+    def force(self, before: Array, rate: Array, load: Array | float, stopping: Array) -> Array:
+        return limited(stopping, self.sizes[0] * load + self.sizes[1])
 
-    def text(self, plant: Plant) -> str:
+    def sentence(self, plant: Plant) -> str:
         more = f", and {self.amount(plant, self.sizes[1])}" if self.sizes[1] > 1e-3 * self.probe else ""
         name = plant.joint_name(self.joint)
         return f"the friction of {name} depends on the load ({100 * self.sizes[0]:.3g} % of it{more})"

@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from itertools import combinations
+from typing import ClassVar
 
 from ctxval._util.arrays import Array
-from ctxval.learning.effects.effect import Effect, OfInput, at_index, exchanged
+from ctxval.learning.effects.effect import (
+    Effect,
+    EffectCandidate,
+    Observed,
+    OfInput,
+    Size,
+    at_index,
+    exchanged,
+    of_ratio,
+)
 from ctxval.learning.effects.plant import Plant
 
 
@@ -17,27 +28,37 @@ class InputGain(Effect):
     name: ClassVar[str] = "input gain"
     input: int | None = 0  #: index of the input; None for all of them together
 
-    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        return u * at_index(u, self.input, self.sizes[0], 1.0), None
+    @classmethod
+    def candidates(cls, observed: Observed) -> Iterator[EffectCandidate]:
+        m = len(observed.plant.inputs)
+        for k in (*range(m), *([None] if m > 1 else [])):
+            yield of_ratio(cls((1.0,), k))
 
-    def text(self, plant: Plant) -> str:
+    def act(self, u: Array, memory: Array) -> tuple[Array, Array]:
+        return u * at_index(u, self.input, self.sizes[0], 1.0), memory
+
+    def sentence(self, plant: Plant) -> str:
         which = "all inputs have" if self.input is None else f"{plant.inputs[self.input][0]} has"
         return f"{which} {self.sizes[0]:.3g} times the effect that M has"
 
-    def mjcf(self, plant: Plant) -> str | None:
+    def repair(self, plant: Plant) -> dict[str, str]:
         if plant.compiled is None or self.input is None:
-            return None
+            return {}
         gear = self.sizes[0] * float(plant.compiled.actuator_gear[self.input, 0])
-        return f'<motor name="{plant.compiled.actuator(self.input).name}" gear="{gear:.5g}"/>'
+        return {"mjcf": f'<motor name="{plant.compiled.actuator(self.input).name}" gear="{gear:.5g}"/>'}
 
 
 @dataclass(frozen=True)
 class ReversedInput(OfInput):
     """An input acts with the opposite sign."""
 
-    sizes: tuple[float, ...] = ()
+    sizes: tuple[Size, ...] = ()
     name: ClassVar[str] = "reversed input"
-    sentence: ClassVar[str] = "{name} acts with the opposite sign"
+    words: ClassVar[str] = "{name} acts with the opposite sign"
+
+    @classmethod
+    def of_input(cls, k: int, most: float, observed: Observed) -> EffectCandidate:
+        return EffectCandidate(cls((), k))
 
     def acts(self, u: Array, before: Array) -> Array:
         return -u
@@ -47,13 +68,18 @@ class ReversedInput(OfInput):
 class SwappedInputs(Effect):
     """Two inputs are exchanged."""
 
-    sizes: tuple[float, ...] = ()
+    sizes: tuple[Size, ...] = ()
     name: ClassVar[str] = "swapped inputs"
     first: int = 0
     second: int = 1
 
-    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        return exchanged(u, [self.first], [self.second]), None
+    @classmethod
+    def candidates(cls, observed: Observed) -> Iterator[EffectCandidate]:
+        for first, second in combinations(range(len(observed.plant.inputs)), 2):
+            yield EffectCandidate(cls((), first, second))
 
-    def text(self, plant: Plant) -> str:
+    def act(self, u: Array, memory: Array) -> tuple[Array, Array]:
+        return exchanged(u, [self.first], [self.second]), memory
+
+    def sentence(self, plant: Plant) -> str:
         return f"the inputs {plant.inputs[self.first][0]} and {plant.inputs[self.second][0]} are exchanged"

@@ -4,32 +4,36 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
-from ctxval.core.model import Model, paired
+from ctxval.core.model import Model, advanced, memory_in, paired
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
+from ctxval.errors import InputError
 from ctxval.learning.effects.effect import Effect
 from ctxval.learning.effects.flow import Flow, Linearisation
+from ctxval.models import MuJoCo
 
 
 @dataclass(frozen=True, eq=False)
 class ModelWithEffects(ShortRepr):
-    """A model with effects, which is also a system. Effects of the inputs act in their order, after the controller.
+    """A model with effects, which is also a model with memory and a system.
 
-    A step of the model is a function of state and input, so it lacks effects that remember inputs, such as a delay;
-    ``complete`` is False then. As a system, it has all effects.
+    Effects of the inputs act in their order, after the controller; those that act in parts of a step are the last ones.
+    A step of a state and an input lacks effects that remember, such as a delay; ``complete`` is False then. If sizes
+    are arrays, the draws are the first axis of states ``(S, q, n)`` and inputs ``(S, q, m)``.
     """
 
     given: Model
     effects: tuple[Effect, ...]
+    inputs: int = 0  #: number of inputs; it must be given for ``start`` if an effect remembers
 
     batched: ClassVar[bool] = True
 
@@ -43,26 +47,123 @@ class ModelWithEffects(ShortRepr):
         """Whether a step has all effects."""
         return not any(effect.remembers for effect in self.effects)
 
+    @functools.cached_property
+    def draws(self) -> int:
+        """The number of draws; 0 if all sizes are numbers."""
+        return max(
+            (len(size) for each in self.effects for size in each.sizes if isinstance(size, np.ndarray)), default=0
+        )
+
+    def __getitem__(self, rows: Rows) -> ModelWithEffects:
+        """Return some draws."""
+        sizes = ([size[rows] if isinstance(size, np.ndarray) else size for size in each.sizes] for each in self.effects)
+        return replace(self, effects=tuple(each.with_sizes(few) for each, few in zip(self.effects, sizes, strict=True)))
+
+    @functools.cached_property
+    def _one_by_one(self) -> tuple[ModelWithEffects, ...]:
+        """The draws, with numbers as sizes, if they have models of MuJoCo of their own; empty otherwise."""
+        changing = [each for each in self.effects if type(each).model is not Effect.model]
+        sizes = [size for each in changing for size in each.sizes if isinstance(size, np.ndarray)]
+        if not sizes or not isinstance(self.given, MuJoCo):
+            return ()
+
+        def number(size: float | Array, k: int) -> float:
+            return float(size[k, 0] if isinstance(size, np.ndarray) else size)
+
+        draws = (
+            [each.with_sizes([number(size, k) for size in each.sizes]) for each in self.effects]
+            for k in range(len(sizes[0]))
+        )
+        return tuple(replace(self, effects=tuple(effects)) for effects in draws)
+
+    @functools.cached_property
+    def _inside(self) -> list[Effect]:
+        return [effect for effect in self.effects if type(effect).within is not Effect.within]
+
+    @functools.cached_property
+    def _of_inputs(self) -> list[Effect]:
+        acting = [effect for effect in self.effects if type(effect).act is not Effect.act]
+        return sorted(acting, key=lambda effect: effect.in_parts)
+
+    def _remembered(self, inputs: int) -> int:
+        return sum(effect.remembered(inputs) for effect in self.effects)
+
+    def start(self, x: Array) -> Array:
+        """Return the memory ``(..., k)`` of closed loops that start in recorded states ``(..., n)``."""
+        if self._remembered(1) and not self.inputs:
+            raise InputError(
+                "a model whose effects remember inputs needs their number: ModelWithEffects(..., inputs=m)."
+            )
+        return self._begun(self.true(x), self.inputs)
+
+    def _begun(self, x: Array, inputs: int) -> Array:
+        if self._one_by_one:
+            of_model = np.stack([memory_in(each.mechanics, few) for each, few in zip(self._one_by_one, x, strict=True)])
+        else:
+            of_model = memory_in(self.mechanics, x)
+        return np.concatenate([np.zeros((*x.shape[:-1], self._remembered(inputs))), of_model], axis=-1)
+
+    def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
+        """Return the next recorded states ``(..., n)`` and the new memory, with all effects."""
+        following, memory = self._advanced(self.true(x), u, memory)
+        return self.recorded(following), memory
+
+    def _advanced(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
+        k = self._remembered(u.shape[-1])
+        acting, kept = self.act(u, memory[..., :k])
+        following, of_model = self._following(x, acting, memory[..., k:])
+        return following, np.concatenate([kept, of_model], axis=-1)
+
     def step(self, x: Array, u: Array) -> Array:
         """Return the next recorded states ``(..., n)`` of recorded states; effects that remember are left out."""
         if x.ndim != u.ndim:
             x, u = map(np.array, paired(x, u))
-        for effect in self.effects:
-            u = u if effect.remembers else effect.follow(u, None)[0]
-        return self.recorded(self.reached(self.true(x), u))
+        nothing = np.empty((*x.shape[:-1], 0))
+        for effect in self._of_inputs:
+            u = u if effect.remembers else effect.act(u, nothing)[0]
+        return self.recorded(self._following(self.true(x), u, nothing)[0])
+
+    def act(self, u: Array, memory: Array) -> tuple[Array, Array]:
+        """Return the inputs that act ``(..., m)``, see :meth:`Effect.act`, and what effects remember ``(..., k)``."""
+        first, kept, inputs = 0, [memory[..., :0]], u.shape[-1]
+        for effect in self._of_inputs:
+            last = first + effect.remembered(inputs)
+            u, after = effect.act(u, memory[..., first:last])
+            kept.append(after)
+            first = last
+        return u, np.concatenate(kept, axis=-1)
+
+    def acting(self, inputs: Array) -> Array:
+        """Return the inputs that act in each step, for commanded ones ``(..., H, m)``; see :meth:`Effect.act`."""
+        return functools.reduce(lambda inputs, effect: effect.acting(inputs), self._of_inputs, inputs)
+
+    def _following(self, x: Array, acting: Array, memory: Array) -> tuple[Array, Array]:
+        """Return the next states for the inputs that act, and the memory of M; without it, M begins anew."""
+        if self._one_by_one:
+            draws = zip(self._one_by_one, x, acting, memory, strict=True)
+            both = zip(*(each._following(*few) for each, *few in draws), strict=True)
+            states, memories = map(np.stack, both)
+            return states, memories
+        if not memory.shape[-1]:
+            return self.reached(x, acting), memory
+        mean = acting.mean(axis=-2) if acting.ndim > x.ndim else acting
+        following, memory = advanced(self.mechanics, x, mean, memory)
+        if self._inside or acting.ndim > x.ndim:  # effects change what a step does, whatever M remembers
+            following = following + self.reached(x, acting) - self.mechanics.step(x, mean)
+        return following, memory
 
     def reached(self, x: Array, acting: Array, at: Linearisation | None = None) -> Array:
         """Return the next states ``(..., n)`` for the inputs that act; M may be linearised ``at`` states near x."""
         duration = math.prod(effect.duration(self.mechanics) for effect in self.effects)
-        inside = [effect for effect in self.effects if type(effect).within is not Effect.within]
         with np.errstate(all="ignore"):
-            while duration > 0:  # whole steps of M, and the rest of one
-                if inside or duration < 1 or acting.ndim > x.ndim:
+            for k in range(math.ceil(np.max(duration))):  # whole steps of M, and the rest of one
+                part = np.clip(duration - k, 0.0, 1.0)
+                if self._inside or np.any(part < 1) or acting.ndim > x.ndim:
                     flow = Flow.of(self.mechanics, x, acting, at)
-                    x = functools.reduce(lambda flow, effect: effect.within(flow), inside, flow).end(min(duration, 1.0))
+                    x = functools.reduce(lambda flow, effect: effect.within(flow), self._inside, flow).end(part)
                 else:
                     x = np.asarray(self.mechanics.step(x, acting))
-                duration, at = duration - 1, None
+                at = None
         return x
 
     def true(self, recorded: Array) -> Array:
@@ -77,30 +178,19 @@ class ModelWithEffects(ShortRepr):
             x = effect.recorded(x)
         return x
 
-    def acting(self, inputs: Array) -> Array:
-        """Return the inputs that act in each step, for commanded ones ``(..., H, m)``; see :meth:`Effect.follow`."""
-        acting = list(np.moveaxis(inputs, -2, 0))
-        for effect in self.effects:
-            memory = None
-            for t, u in enumerate(acting):
-                acting[t], memory = effect.follow(u, memory)
-        return np.stack(acting, axis=inputs.ndim - 2)
-
     def execute(self, controller: Controller, task: Task, noise: Array | None = None) -> Trajectory:
         """Return the closed loop with all effects; the controller acts on what is recorded.
 
         Noise ``(H + 1, ..., n)`` is added to each recorded state; the initial state of the task has it already.
         """
         truth = self.true(np.asarray(task.initial_state, dtype=np.float64) - (0.0 if noise is None else noise[0]))
-        memories: list[Any] = [None] * len(self.effects)
-        added = iter(() if noise is None else noise[1:])
+        memory, added = None, iter(() if noise is None else noise[1:])
 
         def step(_: Array, u: Array) -> Array:
-            nonlocal truth
+            nonlocal truth, memory
             u = np.array(u)
-            for k, effect in enumerate(self.effects):
-                u, memories[k] = effect.follow(u, memories[k])
-            truth = self.reached(truth, u)
+            memory = self._begun(truth, u.shape[-1]) if memory is None else memory
+            truth, memory = self._advanced(truth, u, memory)
             return self.recorded(truth) + next(added, 0.0)
 
         for effect in self.effects:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.core.model import Model
-from ctxval.learning.effects.effect import Effect, EffectCandidate, of_ratio, of_size
+from ctxval.learning.effects.effect import Effect, EffectCandidate, Observed, Parameter, of_ratio, of_size
 from ctxval.learning.effects.plant import Joint, Plant
 
 
@@ -34,22 +34,47 @@ class JointAttribute(OfMuJoCo):
     attribute: str = "damping"  #: ``damping``, ``frictionloss`` or ``armature``
     joint: Joint = Joint(0)  # noqa: RUF009  # it is frozen
 
+    @classmethod
+    def candidates(cls, observed: Observed) -> Iterator[EffectCandidate]:
+        plant, compiled = observed.plant, observed.plant.compiled
+        inertias = None if compiled is None else _inertias(compiled)
+        for joint in plant.joints:
+            if inertias is None or observed.missed[joint.rate] <= 1e-6 * plant.changes[joint.rate]:
+                continue  # the joint has no fault
+            inertia = float(inertias[joint.dof])
+            force = inertia * float(observed.missed[joint.rate]) / plant.dt
+            speed = max(float(plant.changes[joint.position]) / plant.dt, 1e-9)
+            for attribute, size in (("damping", force / speed), ("frictionloss", force), ("armature", inertia)):
+                low = -float(getattr(compiled, f"dof_{attribute}")[joint.dof])
+                starts = (0.3 * size, size) if attribute == "frictionloss" else (0.0,)
+                # More damping would make the integration unstable.
+                most = min(20 * size, inertia / compiled.opt.timestep) if attribute == "damping" else 20 * size
+                effect = cls((0.0,), attribute, joint)
+                yield of_size(effect, Parameter(attribute, low, most, 0.05 * size, effect.unit(plant)), *starts)
+
+    def unit(self, plant: Plant) -> str:
+        """Return the unit of the attribute."""
+        force, angular = plant.force_unit(self.joint), plant.force_unit(self.joint) == "N m"
+        if self.attribute == "armature":
+            return "kg m^2" if angular else "kg"
+        return f"{force} {'s/rad' if angular else 's/m'}" if self.attribute == "damping" else force
+
     def change(self, compiled: Any) -> None:
         getattr(compiled, f"dof_{self.attribute}")[self.joint.dof] += self.sizes[0]
 
-    def text(self, plant: Plant) -> str:
-        name, unit, size = plant.joint_name(self.joint), plant.force_unit(self.joint), self.sizes[0]
+    def sentence(self, plant: Plant) -> str:
+        name, size, unit = plant.joint_name(self.joint), self.sizes[0], self.unit(plant)
         if self.attribute == "frictionloss":
             return f"{name} sticks ({size:.3g} {unit})"
-        more = "more" if size >= 0 else "less"
-        if self.attribute == "damping":
-            per = "s/rad" if unit == "N m" else "s/m"
-            return f"{name} has {more} viscous friction than M ({abs(size):.3g} {unit} {per})"
-        return f"{name} has {more} inertia of the rotor than M ({abs(size):.3g} {'kg m^2' if unit == 'N m' else 'kg'})"
+        what = "viscous friction" if self.attribute == "damping" else "inertia of the rotor"
+        return f"{name} has {'more' if size >= 0 else 'less'} {what} than M ({abs(size):.3g} {unit})"
 
-    def mjcf(self, plant: Plant) -> str | None:
+    def repair(self, plant: Plant) -> dict[str, str]:
         value = float(getattr(plant.compiled, f"dof_{self.attribute}")[self.joint.dof]) + self.sizes[0]
-        return f'<joint name="{plant.joint_name(self.joint)}" {self.attribute}="{value:.5g}"/>'
+        lines = {"mjcf": f'<joint name="{plant.joint_name(self.joint)}" {self.attribute}="{value:.5g}"/>'}
+        if self.attribute != "armature":
+            lines["urdf"] = f'<dynamics {self.attribute.removesuffix("loss")}="{value:.5g}"/>'
+        return lines
 
 
 @dataclass(frozen=True)
@@ -59,22 +84,28 @@ class BodyMass(OfMuJoCo):
     name: ClassVar[str] = "mass"
     body: int = 1
 
+    @classmethod
+    def candidates(cls, observed: Observed) -> Iterator[EffectCandidate]:
+        for body in _heaviest(observed.plant.compiled):
+            yield of_ratio(cls((1.0,), body))
+
     def change(self, compiled: Any) -> None:
         compiled.body_mass[self.body] *= self.sizes[0]
         compiled.body_inertia[self.body] *= self.sizes[0]
 
-    def text(self, plant: Plant) -> str:
+    def sentence(self, plant: Plant) -> str:
         compiled = plant.compiled
         name, mass = compiled.body(self.body).name or f"body {self.body}", float(compiled.body_mass[self.body])
         return f"{name} has a mass of {self.sizes[0] * mass:.3g} kg and not of {mass:.3g} kg"
 
-    def mjcf(self, plant: Plant) -> str | None:
+    def repair(self, plant: Plant) -> dict[str, str]:
         compiled = plant.compiled
         mass = self.sizes[0] * float(compiled.body_mass[self.body])
         inertia = " ".join(f"{self.sizes[0] * value:.5g}" for value in compiled.body_inertia[self.body])
         place = " ".join(f"{value:.5g}" for value in compiled.body_ipos[self.body])
         turn = " ".join(f"{value:.5g}" for value in compiled.body_iquat[self.body])
-        return f'<inertial mass="{mass:.5g}" diaginertia="{inertia}" pos="{place}" quat="{turn}"/>'
+        line = f'<inertial mass="{mass:.5g}" diaginertia="{inertia}" pos="{place}" quat="{turn}"/>'
+        return {"mjcf": line, "urdf": f'<mass value="{mass:.5g}"/>'}
 
 
 @dataclass(frozen=True)
@@ -85,45 +116,44 @@ class MassCentre(OfMuJoCo):
     body: int = 1
     axis: int = 0
 
+    @classmethod
+    def candidates(cls, observed: Observed) -> Iterator[EffectCandidate]:
+        compiled = observed.plant.compiled
+        for body in _heaviest(compiled):
+            extent = float(np.sqrt(compiled.body_inertia[body].max() / compiled.body_mass[body]))
+            for axis in range(3 if extent > 0 else 0):
+                shift = Parameter(cls.name, -3 * extent, 3 * extent, 0.05 * extent, "m")
+                yield of_size(cls((0.0,), body, axis), shift, 0.0)
+
     def change(self, compiled: Any) -> None:
         compiled.body_ipos[self.body, self.axis] += self.sizes[0]
 
-    def text(self, plant: Plant) -> str:
+    def sentence(self, plant: Plant) -> str:
         name = plant.compiled.body(self.body).name or f"body {self.body}"
         return f"the centre of mass of {name} is shifted by {self.sizes[0]:.3g} m along its {'xyz'[self.axis]} axis"
 
-    def mjcf(self, plant: Plant) -> str | None:
+    def repair(self, plant: Plant) -> dict[str, str]:
         place = np.array(plant.compiled.body_ipos[self.body])
         place[self.axis] += self.sizes[0]
-        return f'<inertial pos="{" ".join(f"{value:.5g}" for value in place)}"/>'
+        where = " ".join(f"{value:.5g}" for value in place)
+        return {"mjcf": f'<inertial pos="{where}"/>', "urdf": f'<origin xyz="{where}"/>'}
 
 
-def of_mujoco(plant: Plant, missed: Array) -> Iterator[EffectCandidate]:
-    """Yield what may be wrong with joints and bodies of a model of MuJoCo."""
+def _inertias(compiled: Any) -> Array:
+    """Return the inertia of each degree of freedom in the initial pose, shape ``(nv,)``."""
     import mujoco
 
-    compiled = plant.compiled
-    data = mujoco.MjData(compiled)
+    data, inertias = mujoco.MjData(compiled), np.zeros((compiled.nv, compiled.nv))
     mujoco.mj_forward(compiled, data)
-    inertias = np.zeros((compiled.nv, compiled.nv))
     mujoco.mj_fullM(compiled, data, inertias)
-    for joint in plant.joints:
-        if missed[joint.rate] <= 1e-6 * plant.changes[joint.rate]:  # the joint has no fault
-            continue
-        inertia = float(np.abs(inertias[joint.dof, joint.dof]))
-        force = inertia * float(missed[joint.rate]) / plant.dt
-        speed = max(float(plant.changes[joint.position]) / plant.dt, 1e-9)
-        for attribute, size in (("damping", force / speed), ("frictionloss", force), ("armature", inertia)):
-            low = -float(getattr(compiled, f"dof_{attribute}")[joint.dof])
-            starts = (0.3 * size, size) if attribute == "frictionloss" else (0.0,)
-            # More damping would make the integration unstable.
-            most = min(20 * size, inertia / compiled.opt.timestep) if attribute == "damping" else 20 * size
-            yield of_size(JointAttribute((0.0,), attribute, joint), low, most, 0.05 * size, *starts)
+    return np.asarray(np.abs(np.diagonal(inertias)))
+
+
+def _heaviest(compiled: Any) -> list[int]:
+    """Return the bodies that move, the heaviest ones first; none without a model of MuJoCo."""
+    if compiled is None:
+        return []
     masses = compiled.body_mass
     moved = (compiled.body_dofnum > 0) | (compiled.body_parentid > 0)
     bodies = [body for body in range(1, compiled.nbody) if masses[body] > 0 and moved[body]]
-    for body in sorted(bodies, key=lambda each: -float(masses[each]))[:8]:
-        yield of_ratio(BodyMass((1.0,), body))
-        extent = float(np.sqrt(compiled.body_inertia[body].max() / masses[body]))
-        for axis in range(3 if extent > 0 else 0):
-            yield of_size(MassCentre((0.0,), body, axis), -3 * extent, 3 * extent, 0.05 * extent, 0.0)
+    return sorted(bodies, key=lambda each: -float(masses[each]))[:8]

@@ -26,6 +26,33 @@ class Joint(ShortRepr):
     dof: int | None = None  #: index of the degree of freedom of a MuJoCo model; None for other models
 
 
+def accelerations(n: int, joints: Sequence[Joint], dt: float) -> Array:
+    """Return the part ``(n, n)`` of derivatives that accelerations of joints make, as M integrates."""
+    part = np.zeros((n, n))
+    for joint in joints:
+        part[joint.rate, joint.rate] = 1.0
+        if joint.position is not None:
+            part[joint.position, joint.rate] = (joint.share - 0.5) * dt
+    return part
+
+
+def drive(flow: Flow, joint: Joint, probe: float, dt: float) -> Array:
+    """Return the change of the state ``(..., n)`` by one unit of a force on a joint in a step, in units of ``flow.d``.
+
+    It is measured with a force of the size ``probe``.
+    """
+    model, x, u = flow.model, flow.start, flow.inputs
+    if joint.dof is not None:  # of a model of MuJoCo
+        forces = probe * np.eye(model.compiled.nv)[joint.dof]  # type: ignore[attr-defined]
+        pushed = model.changed(forces=forces).step(x, u)  # type: ignore[attr-defined]
+        return flow.driven((pushed - flow.reached) / probe)
+    if joint.input is not None:
+        moved = u + probe * np.eye(u.shape[-1])[joint.input]
+        return flow.driven((np.asarray(model.step(x, moved)) - flow.reached) / probe)
+    accelerated = accelerations(x.shape[-1], [joint], dt)[:, joint.rate]
+    return np.broadcast_to(dt * accelerated, x.shape)
+
+
 @dataclass(frozen=True, eq=False)
 class Plant(ShortRepr):
     """What sentences, sizes and forces need to know of a model."""

@@ -12,7 +12,17 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.turns import turns
 from ctxval.core.model import Function, Model
-from ctxval.learning.effects.effect import Effect, EffectCandidate, at_index, exchanged, of_ratio, of_size
+from ctxval.learning.effects.effect import (
+    Effect,
+    EffectCandidate,
+    Observed,
+    Parameter,
+    Size,
+    at_index,
+    exchanged,
+    of_ratio,
+    of_size,
+)
 from ctxval.learning.effects.plant import Plant
 
 
@@ -23,13 +33,20 @@ class SensorOffset(Effect):
     name: ClassVar[str] = "sensor offset"
     state: int = 0
 
+    @classmethod
+    def candidates(cls, observed: Observed) -> Iterator[EffectCandidate]:
+        for first, *_ in _groups(observed):
+            size = max(float(np.ptp(observed.x[:, first])), 1e-9)
+            unit = observed.plant.states[first][1]
+            yield of_size(cls((0.0,), first), Parameter(cls.name, -size, size, 0.05 * size, unit), 0.0)
+
     def true(self, recorded: Array) -> Array:
         return recorded - at_index(recorded, self.state, self.sizes[0])
 
     def recorded(self, x: Array) -> Array:
         return x + at_index(x, self.state, self.sizes[0])
 
-    def text(self, plant: Plant) -> str:
+    def sentence(self, plant: Plant) -> str:
         name, unit = plant.states[self.state]
         size = f"{abs(self.sizes[0]):.3g} {unit}".rstrip()
         return f"the sensor of {name} reads {size} too {'much' if self.sizes[0] > 0 else 'little'}"
@@ -42,13 +59,18 @@ class SensorScale(Effect):
     name: ClassVar[str] = "sensor scale"
     states: tuple[int, ...] = (0,)  #: indices of the states that are scaled
 
+    @classmethod
+    def candidates(cls, observed: Observed) -> Iterator[EffectCandidate]:
+        for group in _groups(observed):
+            yield of_ratio(cls((1.0,), group))
+
     def true(self, recorded: Array) -> Array:
         return recorded / at_index(recorded, list(self.states), self.sizes[0], 1.0)
 
     def recorded(self, x: Array) -> Array:
         return x * at_index(x, list(self.states), self.sizes[0], 1.0)
 
-    def text(self, plant: Plant) -> str:
+    def sentence(self, plant: Plant) -> str:
         return f"the sensor of {plant.states[self.states[0]][0]} reads {self.sizes[0]:.3g} times the value"
 
 
@@ -56,7 +78,7 @@ class SensorScale(Effect):
 class WrappedAngle(Effect):
     """The system keeps an angle within a turn, and M does not; or M does, and the system does not."""
 
-    sizes: tuple[float, ...] = ()
+    sizes: tuple[Size, ...] = ()
     name: ClassVar[str] = "wrapped angle"
     state: int = 0
     turn: float = 2 * np.pi
@@ -78,7 +100,7 @@ class WrappedAngle(Effect):
     def gap(self, difference: Array) -> Array:
         return difference - at_index(difference, self.state, self.turn) * np.round(difference / self.turn)
 
-    def text(self, plant: Plant) -> str:
+    def sentence(self, plant: Plant) -> str:
         name, pi = plant.states[self.state][0], self.turn < 7
         whole, half = ("2 pi", "pi") if pi else ("360", "180")
         ends = f"0 to {whole}" if self.low == 0 else f"-{half} to {half}"
@@ -90,10 +112,17 @@ class WrappedAngle(Effect):
 class SwappedJoints(Effect):
     """The recorded states of two joints are exchanged."""
 
-    sizes: tuple[float, ...] = ()
+    sizes: tuple[Size, ...] = ()
     name: ClassVar[str] = "swapped joints"
     first: tuple[int, ...] = (0,)  #: indices of their states, in the same order
     second: tuple[int, ...] = (1,)
+
+    @classmethod
+    def candidates(cls, observed: Observed) -> Iterator[EffectCandidate]:
+        moving = [group for group in _groups(observed) if np.ptp(observed.x[:, group[0]]) > 0]
+        pairs = [group for group in moving if len(group) == len(moving[0])]
+        for first, second in combinations(pairs, 2):
+            yield EffectCandidate(cls((), first, second))
 
     def true(self, recorded: Array) -> Array:
         return exchanged(recorded, self.first, self.second)
@@ -101,22 +130,14 @@ class SwappedJoints(Effect):
     def recorded(self, x: Array) -> Array:
         return self.true(x)
 
-    def text(self, plant: Plant) -> str:
+    def sentence(self, plant: Plant) -> str:
         return f"the sensors of {plant.states[self.first[0]][0]} and {plant.states[self.second[0]][0]} are exchanged"
 
 
-def of_sensors(plant: Plant, x: Array) -> Iterator[EffectCandidate]:
-    """Yield what may be wrong with sensors of recorded states ``(N, n)``."""
-    ranges = np.ptp(x, axis=0)
-    groups = [(joint.rate,) if joint.position is None else (joint.position, joint.rate) for joint in plant.joints]
-    for group in groups:
-        size = max(float(ranges[group[0]]), 1e-9)
-        yield of_size(SensorOffset((0.0,), group[0]), -size, size, 0.05 * size, 0.0)
-        yield of_ratio(SensorScale((1.0,), group))
-    moving = [group for group in groups if ranges[group[0]] > 0]
-    pairs = [group for group in moving if len(group) == len(moving[0])]
-    for first, second in combinations(pairs, 2):
-        yield EffectCandidate(SwappedJoints((), first, second))
+def _groups(observed: Observed) -> list[tuple[int, ...]]:
+    """Return the states that one sensor measures: a position and its rate, or a rate alone."""
+    joints = () if observed.estimated else observed.plant.joints
+    return [(joint.rate,) if joint.position is None else (joint.position, joint.rate) for joint in joints]
 
 
 def wrapped_angles(x: Sequence[Array], following: Sequence[Array]) -> Iterator[EffectCandidate]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from ctxval.core.model import Model
-from ctxval.learning.effects.effect import Effect
+from ctxval.learning.effects.effect import Effect, EffectCandidate, Observed, Parameter, Size, of_size
 from ctxval.learning.effects.plant import Plant
 from ctxval.models import MuJoCo
 
@@ -17,13 +18,17 @@ class TimeStep(Effect):
 
     name: ClassVar[str] = "time step"
 
-    def duration(self, model: Model) -> float:
+    @classmethod
+    def candidates(cls, observed: Observed) -> Iterator[EffectCandidate]:
+        yield of_size(cls((1.0,)), Parameter(cls.name, 0.2, 5.0, 0.1, "steps"), 0.5, 0.95, 1.05, 2.0)
+
+    def duration(self, model: Model) -> Size:
         return 1.0 if isinstance(model, MuJoCo) else self.sizes[0]
 
     def model(self, model: Model) -> Model:
         if not isinstance(model, MuJoCo):
             return model
-        substeps = max(1, round(self.sizes[0] * model.substeps))
+        substeps = max(1, round(float(self.sizes[0]) * model.substeps))
 
         def change(compiled: Any) -> None:
             compiled.opt.timestep *= self.sizes[0] * model.substeps / substeps
@@ -32,6 +37,6 @@ class TimeStep(Effect):
         changed.substeps = substeps
         return changed
 
-    def text(self, plant: Plant) -> str:
+    def sentence(self, plant: Plant) -> str:
         step, taken = 1e3 * plant.dt, 1e3 * plant.dt * self.sizes[0]
         return f"one step of the system takes {taken:.4g} ms of M, and not {step:.4g} ms"

@@ -35,7 +35,7 @@ def distances(context: ReportContext) -> Markup:
     predicted, d = _predicted(context, model), context.space.dimension
     # The distance over one parameter is on the first screen; a suite has no tasks between its own.
     if d == 1 or context.suite is not None:
-        return joined([element("div", predicted, class_="charts"), *_region(context)])
+        return joined([element("div", predicted, class_="charts")])
     parts = [paragraph("Lines, bands and maps are pictures of what the trials suggest, and no certificate.")]
     if d == 2:
         values = (_estimated(context, _grid_of_tasks()) or model.predict(_grid_of_tasks())).median
@@ -54,7 +54,7 @@ def distances(context: ReportContext) -> Markup:
     rows = ((label, percent(share), bar(share)) for label, share in shares)
     caption = f"Sensitivity of the distance: {meaning} (total Sobol index)"
     sensitivity = table(caption, ("Parameter", "Share", "Bar"), rows)
-    return joined([*parts, element("div", sensitivity, predicted, class_="charts"), *_region(context)])
+    return joined([*parts, element("div", sensitivity, predicted, class_="charts")])
 
 
 def _estimated(context: ReportContext, unit: Array) -> Band | None:
@@ -174,41 +174,6 @@ def _predicted(context: ReportContext, model: DistanceModel) -> Chart:
         executed, expected = zip(*((distance_of(trial), stored.median) for trial, stored in beforehand), strict=True)
         chart.marks(executed, expected, "covering", "stored before the execution")
     return chart
-
-
-def _region(context: ReportContext) -> list[Markup]:
-    """Return where the prediction plus the margin of a region certificate keeps the threshold; nothing without one."""
-    certificate, dynamics, tau = context.certificate, context.dynamics, context.threshold
-    if certificate is None or certificate.kind != "region" or dynamics is None or tau is None:
-        return []
-    margin, before = float(certificate.details["margin"]), int(certificate.details["learned_before"])
-    space, d, model = context.space, context.space.dimension, context.distance_model
-    unit = np.linspace(0, 1, _CURVE)[:, None]
-    if d > 1:
-        unit = _grid_of_tasks() if d == 2 else np.random.default_rng(0).random((400, d))
-    bounds = dynamics.expected(context.trials, unit, before) + margin
-    inside, points, label = bounds <= tau, space.from_unit(unit), f"predicted {context.distance_label} + margin"
-    meaning = paragraph(
-        f"A task keeps the threshold {number(tau)} if its predicted distance plus the margin {number(margin)} of the "
-        f"certificate is at most the threshold. This holds for {percent(float(inside.mean()))} of the tasks that are "
-        f"drawn here. {certificate.statement}"
-    )
-    title = "Tasks that keep the threshold by the prediction plus its margin"
-    drawn: object
-    if d == 2:
-        drawn = _map(context, title, np.nan_to_num(bounds, nan=np.nanmax(bounds)), label)
-    elif d == 1:
-        axes = _parameter_axis(context.space, 0), Axis.over(label, bounds, tau, zero=True)
-        chart = Chart("Predicted distance plus margin, and the threshold", *axes)
-        drawn = chart.line(points[:, 0], bounds, "mean", label).limit(tau, "threshold", "threshold")
-    else:  # the chart shows the two parameters to which the distance is most sensitive
-        i, j = (0, 1) if model is None else model.influence[:2]
-        drawn = chart = Chart(title, _parameter_axis(context.space, i), _parameter_axis(context.space, j), height=360)
-        if not inside.all():
-            chart.marks(points[~inside, i], points[~inside, j], "weak", "above the threshold or not predicted")
-        if inside.any():
-            chart.marks(points[inside, i], points[inside, j], "sample", "keeps the threshold")
-    return [heading("Where the threshold is kept"), meaning, element("div", drawn, class_="charts wide")]
 
 
 def convergence(context: ReportContext) -> Markup:

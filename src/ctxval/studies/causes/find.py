@@ -224,7 +224,9 @@ class _Study:
             raise InputError("the model's steps are not finite at the recorded states.")
         names = validation.names(x.shape[1], u.shape[1])
         self.plant = plant_of(self.model, executions[0].plan.task.dt, *names, x[usable], u[usable])
-        self.dictionary = candidates(self.plant, x[usable], u[usable], residuals[usable], outputs=self.outputs)
+        seconds = max(run.horizon for run in runs) * self.plant.dt
+        records = x[usable], u[usable], residuals[usable]
+        self.dictionary = candidates(self.plant, *records, seconds=seconds, estimated=self.outputs)
         self.loops = ClosedLoops(validation, executions)
         self.before = max(self.loops.distances)
 
@@ -299,8 +301,7 @@ class _Study:
         results = []
         for each in self.dictionary:
             together = (*self.known, *beside, each)
-            within = [other for other in together if not getattr(other.effect, "held", True)]
-            if each.effect.kind not in kinds and len(within) < 2:
+            if each.effect.kind not in kinds and sum(other.effect.in_parts for other in together) < 2:
                 results.append((*screened(self.some, together), together))
             advance(1)
         results.sort(key=lambda result: result[0])
@@ -337,7 +338,9 @@ class _Study:
         others.sort(key=lambda each: len(each.sizes))  # the simplest are tried first
         group = [best, *(self._in_closed_loop(each) for each in others[: self.settings.checked])]
         group = [each for each in group if 1 - each.share <= 2 * (1 - best.share) + 1e-3]
-        first = min((each for each in group if each.counts(self.before)), key=lambda each: len(each.explanation.sizes))
+        # The fewest sizes; and a real actuator acts late by parts of a step, not by means over whole ones.
+        counting = [each for each in group if each.counts(self.before)]
+        first = min(counting, key=lambda each: (len(each.explanation.sizes), not any(c.in_parts for c in each.causes)))
         return first, [each for each in group if each is not first and not _contains(each, first)]
 
     def _in_closed_loop(self, explanation: Explanation) -> Explained:

@@ -128,7 +128,7 @@ class CauseReport(ShortRepr):
         return f"{what[0].upper()}{what[1:]}. With {together} in M, {effect}. This explains {share}."
 
     def _text(self, each: Explained) -> str:
-        return " and ".join(cause.text(self.plant) for cause in each.causes)
+        return " and ".join(cause.sentence(self.plant) for cause in each.causes)
 
     @property
     def separating_sentence(self) -> str | None:
@@ -149,13 +149,23 @@ class CauseReport(ShortRepr):
         if not self.named:
             return None
         made = "".join(f"    {cause.python()},\n" for cause in self.causes)
-        return f"from ctxval.studies import causes\n\nmodel = causes.ModelWithEffects(model, (\n{made}))"
+        repaired = self.explained[0].explanation.repaired
+        inputs = "" if repaired.complete else f", inputs={repaired.inputs}"
+        return f"from ctxval.studies import causes\n\nmodel = causes.ModelWithEffects(model, (\n{made}){inputs})"
 
     @property
     def mjcf(self) -> tuple[str, ...]:
         """The lines of MJCF that put the causes into a MuJoCo model; empty if there are none."""
-        changes = (cause.mjcf(self.plant) for cause in self.causes)
-        return tuple(each for each in changes if each is not None)
+        return self._lines("mjcf")
+
+    @property
+    def urdf(self) -> tuple[str, ...]:
+        """The lines of URDF with the named causes, for elements of the same robot; empty if there are none."""
+        return self._lines("urdf")
+
+    def _lines(self, language: str) -> tuple[str, ...]:
+        repairs = (cause.repair(self.plant) for cause in self.causes)
+        return tuple(each[language] for each in repairs if language in each)
 
     def to_json(self) -> dict[str, Any]:
         """Return everything as plain values."""
@@ -182,6 +192,7 @@ class CauseReport(ShortRepr):
             "units": self.units,
             "python": self.python,
             "mjcf": list(self.mjcf),
+            "urdf": list(self.urdf),
         }
 
     def __repr__(self) -> str:

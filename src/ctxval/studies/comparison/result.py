@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from ctxval._util.files import MADE_BY
 from ctxval._util.representation import ShortRepr, call, line, lines
-from ctxval._util.representation import table as html_table
-from ctxval._util.texts import markdown_text, shortened
 from ctxval.certificates.bounds import at_most
 from ctxval.core.space import Point
 from ctxval.studies.comparison.candidates import Question
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # What each question is about, and the columns of the tables of candidates and of pairs.
 WORDS: dict[Question, str] = {"worst": "largest distance d*", "mean": "expected distance"}
@@ -136,105 +128,13 @@ class Comparison:
                 pair[end] = pair[end] if pair[end] is not None and np.isfinite(pair[end]) else None
         return {**plain, "decided": self.decided, "rankings": {q: self.ranking(q) for q in self.questions}}
 
-    def to_markdown(self) -> str:
-        """Return the tables, the reasons and the assumptions as Markdown."""
-
-        def table(*rows: Sequence[str]) -> str:
-            whole = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
-            return "\n".join(f"| {' | '.join(map(markdown_text, cells))} |" for cells in whole)
-
-        units = f" The distances are in {markdown_text(self.units)}." if self.units else ""
-        rankings = ((WORDS[question].capitalize(), self.ranking_text(question)) for question in self.questions)
-        reasons = ((", ".join(map(markdown_text, (pair.first, pair.second))), pair.reason) for pair in self.pairs)
-        parts = [
-            "## Comparison",
-            "\n".join(f"- {what}: {markdown_text(ranking)}" for what, ranking in rankings),
-            f"{self.executions} executions of at most {self.budget}. All decisions hold together with confidence "
-            f"{self.confidence:.6g}.{units}",
-            table(CANDIDATES, *(candidate.cells for candidate in self.candidates)),
-            table(PAIRS, *(pair.cells for pair in self.pairs)),
-            "\n".join(f"- {names}: {markdown_text(reason)}." for names, reason in reasons),
-            "It assumes that",
-            "\n".join(f"- {markdown_text(assumption)};" for assumption in self.assumptions),
-            f"<!-- {MADE_BY} -->",
-        ]
-        return "\n\n".join(parts) + "\n"
-
-    def plot(self) -> Figure:
-        """Return a figure with a panel for each question: executed distances, bounds and intervals."""
-        from matplotlib.figure import Figure  # imported here: loading it takes longer than a short comparison
-
-        panels = len(self.questions)
-        rows = max(len(self.candidates), len(self.pairs) // max(1, panels))
-        figure = Figure(figsize=(5.2 * panels, 1.9 + 0.42 * rows), layout="constrained")
-        for ax, question in zip(figure.subplots(1, panels, squeeze=False)[0], self.questions, strict=True):
-            names, label = (_draw_worst if question == "worst" else _draw_mean)(ax, self)
-            ax.set_yticks(range(len(names)), [shortened(name, 24) for name in names])
-            ax.set_ylim(len(names) - 0.5, -0.5)
-            ax.grid(axis="x", alpha=0.25)
-            ax.set_xlabel(f"{label} [{self.units}]" if self.units else label)
-            ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=2, fontsize=8, frameon=False)
-        return figure
-
     def __repr__(self) -> str:
         known = {name: getattr(self, name) for name in ("confidence", "executions", "budget", "decided")}
         rankings = (f"{WORDS[question]}: {line(self.ranking_text(question))}" for question in self.questions)
         return lines(call(self, **known), *rankings)
-
-    def _repr_html_(self) -> str:
-        rows = [
-            *((WORDS[question], self.ranking_text(question)) for question in self.questions),
-            *((f"{pair.first}, {pair.second}", pair.reason) for pair in self.pairs),
-            ("executions", f"{self.executions} of at most {self.budget}"),
-            ("confidence of all decisions together", self.confidence),
-            *(("assumes", assumption) for assumption in self.assumptions),
-        ]
-        return html_table("Comparison", rows)
 
 
 def _number(value: float | None) -> str:
     if value is None:
         return "-"
     return f"{value:.4g}" if np.isfinite(value) else ("unlimited" if value > 0 else "-unlimited")
-
-
-# Okabe and Ito's colours survive colour blindness; the markers survive grey print.
-_BLUE, _ORANGE, _GREY = "#0072B2", "#D55E00", "#707070"
-
-
-def _draw_worst(ax: Axes, comparison: Comparison) -> tuple[list[str], str]:
-    """Draw the largest executed distance and the bound on d* of each candidate; return its rows and its label."""
-    ax.set_title("largest distance d*")
-    for row, candidate in enumerate(comparison.candidates):
-        largest, bound = candidate.largest, candidate.bound
-        if largest is not None:
-            ax.plot(largest, row, "o", color=_BLUE, label="largest executed distance" if not row else None)
-        if largest is not None and bound is not None:
-            ax.plot([largest, bound], [row, row], "-", color=_GREY, linewidth=1.5)
-        if bound is not None:
-            ax.plot(bound, row, "|", color=_ORANGE, markersize=14, markeredgewidth=2.5)
-    ax.plot([], [], "|", color=_ORANGE, markersize=12, markeredgewidth=2.5, label="bound on d*")
-    ends = [end for item in comparison.candidates for end in (item.largest, item.bound) if end is not None]
-    ax.set_xlim(0, 1.08 * max(ends, default=1.0) or 1.0)
-    return [candidate.name for candidate in comparison.candidates], "distance"
-
-
-def _draw_mean(ax: Axes, comparison: Comparison) -> tuple[list[str], str]:
-    """Draw the confidence sequence of each difference of expected distances; return its rows and its label."""
-    pairs = [pair for pair in comparison.pairs if pair.question == "mean"]
-    ax.set_title("difference of expected distances")
-    ax.axvline(0.0, color="black", linewidth=1)
-    ends = [abs(end) for pair in pairs for end in (pair.low, pair.high, pair.estimate) if end is not None]
-    reach = 1.15 * max(filter(np.isfinite, ends), default=1.0) or 1.0
-    ax.plot([], [], "o-", color=_BLUE, label="decided")
-    ax.plot([], [], "s--", color=_GREY, markerfacecolor="white", label="undecided")
-    for row, pair in enumerate(pairs):
-        low, high = (reach if end is None else end for end in (pair.low, pair.high))
-        decided = pair.smaller is not None
-        colour, line, marker = (_BLUE, "-", "o") if decided else (_GREY, "--", "s")
-        ax.plot(np.clip([low, high], -2 * reach, 2 * reach), [row, row], line, color=colour, linewidth=2)
-        if pair.estimate is not None:
-            ax.plot(pair.estimate, row, marker, color=colour, markerfacecolor=colour if decided else "white")
-    ax.set_xlim(-reach, reach)
-    ax.locator_params(axis="x", nbins=5)
-    return [f"{shortened(pair.first, 24)} - {shortened(pair.second, 24)}" for pair in pairs], "difference"

@@ -138,7 +138,7 @@ class CauseRepair(ShortRepr, Method):
                 return explained(segments, best.candidates, best.sizes).repaired
 
         learned = repaired(records)
-        note = " and ".join(cause.text(self.report.plant) for cause in learned.effects)
+        note = " and ".join(effect.sentence(self.report.plant) for effect in learned.effects)
         return Learned(learned, held_out(repaired, model, records), (note,))
 
 

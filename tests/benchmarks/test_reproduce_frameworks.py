@@ -14,9 +14,8 @@ from ctxval._util.arrays import Array
 from ctxval.errors import ModelError
 from ctxval.paper.cases import pendulum
 from ctxval.paper.cases.pendulum import Pendulum
-from ctxval.paper.reproduce.frameworks import _Pair, frameworks, worst_open_loop
 from facts import refuses
-from rig_thorough import more
+from reproduce.frameworks import _Pair, frameworks, worst_open_loop
 
 
 @pytest.fixture(scope="module")
@@ -40,11 +39,6 @@ def test_the_closed_loop_profiles_are_the_distances_of_validations(result: dict[
     goals = np.array(result["goals"])[:, None]
     for name, distance in (("ccdt", distances.WholeTrajectory()), ("custom", distances.FinalState(norm=1))):
         np.testing.assert_allclose(result[name], with_distance(distance).distances(goals), rtol=1e-9)
-
-
-def test_ccdt_is_largest_at_the_goal_farthest_from_the_start_as_in_the_paper(result: dict[str, Any]) -> None:
-    goals = result["goals"]
-    assert abs(goals[int(np.argmax(result["ccdt"]))]) <= 1.01 * (goals[1] - goals[0])  # the grid is coarse
 
 
 def test_open_loop_distances_are_far_larger_than_closed_loop_ones_and_have_converged(result: dict[str, Any]) -> None:
@@ -99,15 +93,6 @@ def test_the_final_distance_of_linear_systems_is_the_sum_of_absolute_responses(s
     assert (np.abs(inputs) == 2.0).all()
 
 
-@pytest.mark.parametrize("seed", [0, *more(1, 2, 3)])
-def test_the_trajectory_distance_of_linear_systems_is_the_largest_response_at_any_time(seed: int) -> None:
-    pair, x, bound = linear_pair(seed), np.array([1.0, -2.0]), np.array([0.5])
-    _, found = worst_open_loop(*pair, Task(x, horizon=40, dt=0.1), 0.5, WHOLE, restarts=16)
-    directions = [sign * row for row in np.eye(2) for sign in (-1, 1)]
-    expected = max(worst_functional(pair, x, t, bound, row) for t in range(1, 41) for row in directions)
-    assert found[0] == pytest.approx(expected, rel=1e-10)
-
-
 def distances_of(
     system: models.Model,
     model: models.Model,
@@ -148,23 +133,6 @@ def test_the_worst_beats_random_sequences_and_stays_within_the_bound(swing: mode
     assert np.abs(inputs).max() <= 1.0
 
 
-def test_more_restarts_never_find_less(swing: models.Model) -> None:
-    few, more = pump(swing, 2, horizon=60)[1], pump(swing, 6, horizon=60)[1]
-    assert more.shape == (6,)
-    assert more[0] >= few[0] - 1e-9
-    assert (np.diff(more) <= 0).all()
-
-
-def test_no_single_switch_improves_the_result_which_is_what_its_inputs_do(swing: models.Model) -> None:
-    inputs, found = pump(swing, 1, seed=3, horizon=40)
-    switched = np.repeat(inputs[None], 41, axis=0)
-    switched[np.arange(40), np.arange(40)] *= -1
-    task = Task([np.pi, 0.0], horizon=40, dt=0.02)
-    values = distances_of(swing, STILL, task, switched, FINAL)
-    assert values[-1] == pytest.approx(found[0], rel=1e-12)
-    assert values.max() <= found[0] * (1 + 1e-9)
-
-
 def test_the_gradient_is_that_of_finite_differences(swing: models.Model) -> None:
     rng = np.random.default_rng(0)
     pair = _Pair(swing, linear_pair(0)[0], Task([1.0, -0.5], horizon=12, dt=0.02), 1.0)
@@ -172,11 +140,6 @@ def test_the_gradient_is_that_of_finite_differences(swing: models.Model) -> None
     moves = 1e-5 * np.eye(12)[..., None]
     up, down = ((weights * pair.gap(inputs + sign * moves)).sum(axis=(-1, -2)) for sign in (1, -1))
     np.testing.assert_allclose(pair.gradient(inputs, weights)[:, 0], (up - down) / 2e-5, rtol=1e-6, atol=1e-8)
-
-
-def test_a_model_without_any_error_has_no_distance() -> None:
-    _, found = worst_open_loop(STILL, STILL, Task([1.0, 2.0], horizon=5, dt=1.0), 1.0, WHOLE, restarts=2)
-    assert found[0] == 0
 
 
 def test_systems_that_diverge_have_no_worst_open_loop() -> None:

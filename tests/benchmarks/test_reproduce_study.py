@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from ctxval.errors import InputError, UnknownNameError
-from ctxval.paper.reproduce import QUICK, STUDIES, reproduce, studies_named, table_text
-from ctxval.paper.reproduce.jobs import Job, Results
-from ctxval.paper.reproduce.pendulum import _worst_goal
-from ctxval.paper.reproduce.study import Claim, Scale, agreement, executions_within, running_estimate, spread
 from facts import assert_names, refuses
+from reproduce import QUICK, STUDIES, reproduce, studies_named, table_text
+from reproduce.jobs import Job, Results
+from reproduce.pendulum import _worst_goal
+from reproduce.study import Claim, Scale, agreement, executions_within, running_estimate, spread
 
 
 def test_the_estimate_of_sc_is_the_largest_and_that_of_sd_the_sixth() -> None:

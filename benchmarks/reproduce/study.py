@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask
-from ctxval.paper.reproduce.frameworks import PAPER
-from ctxval.paper.reproduce.jobs import Job, Results, distances_of
+from reproduce.frameworks import PAPER
+from reproduce.jobs import Job, Results, distances_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval import cases, searches
-from ctxval.paper.reproduce.frameworks import PAPER
-from ctxval.paper.reproduce.jobs import Job, Results, case_digest, distances_of, records, run_job
-from ctxval.paper.reproduce.study import running_estimate
+from reproduce.frameworks import PAPER
+from reproduce.jobs import Job, Results, case_digest, distances_of, records, run_job
+from reproduce.study import running_estimate
 
 PROFILE = Job("profile", "pendulum", 0, budget=21)
 

@@ -20,21 +20,22 @@ import numpy as np
 import scipy
 from threadpoolctl import threadpool_info
 
+import ctxval
 from ctxval import Campaign, Experiment, Validation, cases, searches
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.code_digest import module_digest
-from ctxval._util.json_lines import JsonLines
 from ctxval.distances import TrackingError
 from ctxval.gp.kernels import Matern
 from ctxval.gp.surrogate import fit_surrogate
 from ctxval.paper.cases import arm
-from ctxval.paper.reproduce.frameworks import PAPER, closed_loops, frameworks
+from json_lines import JsonLines
+from reproduce.frameworks import PAPER, closed_loops, frameworks
 
 SEARCHES = ("gp", "searches")  #: the folders of the package that choose tasks from distances
 
 AUTO = (*SEARCHES, "learning")  #: the folders of the package that choose tasks from trajectories
 
-_PACKAGE = Path(__file__).parents[2]
+_PACKAGE = Path(ctxval.__file__).parent
 
 
 @functools.cache

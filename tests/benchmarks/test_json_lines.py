@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctxval._util.json_lines import JsonLines
 from ctxval.errors import InputError
 from facts import refuses
+from json_lines import JsonLines
 
 KEY = ("case", "seed")
 

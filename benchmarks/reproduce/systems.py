@@ -10,10 +10,10 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.core.soundness import MISSED
 from ctxval.paper.cases import arm, dubins
-from ctxval.paper.reproduce import study
-from ctxval.paper.reproduce.frameworks import PAPER
-from ctxval.paper.reproduce.jobs import Job, Result, Results, distances_of
-from ctxval.paper.reproduce.study import TECHNIQUES, Claim, Columns, ExecutionsWithin, Scale, Study, agreement, spread
+from reproduce import study
+from reproduce.frameworks import PAPER
+from reproduce.jobs import Job, Result, Results, distances_of
+from reproduce.study import TECHNIQUES, Claim, Columns, ExecutionsWithin, Scale, Study, agreement, spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,10 +10,10 @@ import numpy as np
 from ctxval import Trajectory, cases, plot
 from ctxval._util.arrays import Array
 from ctxval.gp.surrogate import fit_surrogate
-from ctxval.paper.reproduce import study
-from ctxval.paper.reproduce.frameworks import PAPER, closed_loops
-from ctxval.paper.reproduce.jobs import INFORMED, Job, Results, distances_of
-from ctxval.paper.reproduce.study import TECHNIQUES, Claim, Columns, Scale, Study, agreement, ranged, spread
+from reproduce import study
+from reproduce.frameworks import PAPER, closed_loops
+from reproduce.jobs import INFORMED, Job, Results, distances_of
+from reproduce.study import TECHNIQUES, Claim, Columns, Scale, Study, agreement, ranged, spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
