@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from scipy.spatial.distance import cdist
+import scipy
 
 from ctxval._util.arrays import Array, Mask, single_threaded
 from ctxval._util.checked import NonNegativeFloat, PositiveInt, Seconds
@@ -248,7 +248,7 @@ class TrustRegion(SequentialSearch):
         return _Candidate(point, float(expected[0]), float(doubt[0]))
 
     def _is_new(self, points: Array, history: _History) -> Mask:
-        others = cdist(points, history.others).min(axis=1, initial=np.inf)
+        others = scipy.spatial.distance.cdist(points, history.others).min(axis=1, initial=np.inf)
         return np.asarray((_gaps(points, history) > NEAR) & (others > 0.05 * np.sqrt(self.dimension)))
 
     def _state(self, history: _History) -> _Region:
@@ -279,7 +279,7 @@ class TrustRegion(SequentialSearch):
 def _gaps(points: Array, history: _History) -> Array:
     """Return the largest difference of a coordinate from the nearest point with a known value, ``(m,)``."""
     known = history.points[np.isfinite(history.values)]
-    return np.asarray(cdist(points, known, "chebyshev").min(axis=1, initial=np.inf))
+    return np.asarray(scipy.spatial.distance.cdist(points, known, "chebyshev").min(axis=1, initial=np.inf))
 
 
 def _log_error(expected: Array, values: Array) -> float:

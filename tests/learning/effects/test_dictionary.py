@@ -135,5 +135,6 @@ def test_draws_of_effects_act_around_draws_of_the_residual() -> None:
     states, k = loop(together, begun, inputs), len(residuals) // 2
     sizes = [[float(size[k, 0]) for size in each.sizes] for each in chosen]
     numbers = tuple(each.with_sizes(few) for each, few in zip(chosen, sizes, strict=True))
-    alone = ModelWithEffects(residuals[[k]], numbers, 1)
+    alone, some = ModelWithEffects(residuals[[k]], numbers, 1), together[np.array([0, k])]
+    np.testing.assert_allclose(loop(some, begun[[0, k]], inputs[:, [0, k]]), states[:, [0, k]], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(states[:, k], loop(alone, begun[k], inputs[:, k]), rtol=1e-9, atol=1e-12)
