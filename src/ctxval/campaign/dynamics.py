@@ -337,7 +337,9 @@ class CampaignDynamics:
             coverage=learned.coverage,
             unsampled_parameter=learned.unsampled_parameter,
             unsampled_corner=unsampled_corner(learned.executed, self.study.validation.space, learned.coverage.task),
-            low_dimensional=worst.points.shape[1] <= LIMITS.low_dimensional and self.study.planner.batched,
+            # Loops on M with other parameters are cheap enough to search more of them.
+            low_dimensional=self.study.planner.batched
+            and (worst.points.shape[1] <= LIMITS.low_dimensional or bool(learned.values)),
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
             actuator=None if actuator is None else (float(actuator.delay), float(actuator.lag)),

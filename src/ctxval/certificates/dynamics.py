@@ -40,7 +40,7 @@ from ctxval.errors import CertificateError
 # Attributes of the evidence that are numbers of the certificate as well.
 _COPIED = (
     *("noise", "quantile", "lags", "actuator", "physical", "suspect", "without_model", "without_data", "estimated"),
-    *("friction", "peak_ratio", "jump", "search_shortfall", "disagreement", "negligible"),
+    *("friction", "parameters", "peak_ratio", "jump", "search_shortfall", "disagreement", "negligible"),
 )
 MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
 
@@ -133,7 +133,9 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
     if doubt is None and opened:
         doubt, withdrawn_by = str(opened[0]), opened[0].code
     empty = None if sample.suite is not None else largest_empty_box(sample.points)
-    statement = statements.dynamics_statement(upper, error, confidence, evidence.quantile)
+    statement = statements.dynamics_statement(
+        upper, error, confidence, evidence.quantile, parametric=evidence.is_parametric
+    )
     if evidence.negligible:
         statement = f"If {statements.SMALL_ERRORS}, d* is at most {upper:.6g}."
     level = upper if sample.threshold is None else sample.threshold

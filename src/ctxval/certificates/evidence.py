@@ -68,7 +68,7 @@ class Evidence(ShortRepr):
     untested_rest: UntestedRest | None = None  #: where friction at rest was not tested; None without dry friction
     #: the uncertain parameters of M: median, 5 % and 95 % quantile of each by its name; empty without any
     parameters: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
-    #: of M with uncertain parameters, the deviation of a task's distance that nothing explains, as a share of the largest
+    #: of M with uncertain parameters, the deviation of a task's distance that they leave, as a share of the largest
     scatter: float = 0.0
     #: the largest distance under errors of M as small as all that were recorded; 0 if such errors are learned
     negligible: float = 0.0
@@ -80,6 +80,11 @@ class Evidence(ShortRepr):
     threshold: float | None = None  #: the value that the bound must not exceed; None if there is none
     idle: tuple[int, ...] = ()  #: the indices of the task parameters that M's loops do not depend on
     limits: CheckLimits = LIMITS  #: those of the checks
+
+    @property
+    def is_parametric(self) -> bool:
+        """Whether uncertain parameters of M are learned, which hold beyond the records, too."""
+        return bool(self.parameters)
 
     @property
     def rank(self) -> int:

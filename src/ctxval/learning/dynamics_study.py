@@ -245,7 +245,7 @@ class DynamicsStudy(ShortRepr):
         if posterior is None:
             return None
         points = np.array([point for point, _ in executed])
-        return ParametricDynamics(self, posterior.plain, points, loops, False, ledger=ledger, parametric=posterior)
+        return ParametricDynamics(self, posterior.plain, points, loops, ledger=ledger, parametric=posterior)
 
     def regular(self, executed: Executed) -> LearnedDynamics | None:
         """Return what the regular transitions of executions teach; None if there are no irregular ones."""

@@ -202,7 +202,9 @@ def blocks_of(lengths: Sequence[int], count: int, horizon: int, block: int, rng:
     enough (moving-block bootstrap, Kuensch 1989).
     """
     firsts = np.concatenate([[0], np.cumsum(lengths)[:-1]])
-    starts = np.concatenate([first + np.arange(max(n - block + 1, 1)) for first, n in zip(firsts, lengths, strict=True)])
+    starts = np.concatenate(
+        [first + np.arange(max(n - block + 1, 1)) for first, n in zip(firsts, lengths, strict=True)]
+    )
     blocks = -(-horizon // block)
     chosen = starts[rng.integers(len(starts), size=(count, blocks))]
     rows = (chosen[..., None] + np.arange(block)).reshape(count, -1)[:, :horizon]

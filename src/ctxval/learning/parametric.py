@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -48,7 +48,7 @@ class ParametricSettings:
     predicted: int = 120  # draws that predict an execution
     matters: float = 0.01  # deviation of a task's distance by rests that matters, as a share of the largest distance
     tasks: int = 6  # with the largest distances, of which this is asked
-    parameters: ParameterSettings = ParameterSettings()
+    parameters: ParameterSettings = field(default_factory=ParameterSettings)
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,7 +91,7 @@ class _Drawn:
         return np.asarray(self.model.function(x, u, theta), dtype=np.float64)
 
     def _takes_together(self, x: Array, u: Array) -> bool:
-        """Return whether the function takes parameters ``(p, S, 1, ...)`` with batches as it takes those of one draw."""
+        """Return whether the function takes parameters ``(p, S, 1, ...)`` as it takes those of each draw alone."""
         model = self.model
         if model._together is None:
             model._together = False

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ctxval._util.representation import counted
@@ -163,9 +163,12 @@ IRREGULAR = (
 """What an envelope assumes if it is learned without some recorded steps."""
 
 
-def dynamics_statement(upper: float, error: float, confidence: float, quantile: float | None = None) -> str:
+def dynamics_statement(
+    upper: float, error: float, confidence: float, quantile: float | None = None, *, parametric: bool = False
+) -> str:
     """Return the bound on d*, or on the quantile of the distance at the worst task, from learned dynamics."""
-    bound = f"With {percent(confidence)} probability under a Gaussian process of the residual dynamics"
+    law = "the posterior of M's uncertain parameters" if parametric else "a Gaussian process of the residual dynamics"
+    bound = f"With {percent(confidence)} probability under {law}"
     if quantile is not None:
         which = f"the {quantile:g} quantile of the distance"
         return f"{bound} with noise, {which} is at most {with_error(upper, error)} in every task."
@@ -174,6 +177,17 @@ def dynamics_statement(upper: float, error: float, confidence: float, quantile: 
 
 SMALL_ERRORS = "M errs nowhere by more than its largest error in a recorded step"
 """The assumption if the errors of M are negligible in all executions."""
+
+_PARAMETRIC = (
+    "in every task, also in states that no execution entered, the system is M with other values of its uncertain "
+    "parameters, and differs from it in a step as in the recorded steps"
+)
+
+
+def in_words(parameters: Mapping[str, Sequence[float]]) -> str:
+    """Return the median of each parameter with its 5 % and 95 % quantiles."""
+    return ", ".join(f"{name} {median:.4g} [{low:.4g}, {high:.4g}]" for name, (median, low, high) in parameters.items())
+
 
 _WITHOUT_DATA = (
     "the data that M was made from contradict the executions and are left out: M was learned on another system, or the "
@@ -214,6 +228,12 @@ def dynamics_assumptions(evidence: Evidence) -> tuple[str, ...]:
             f"time or with the task{but}"
         )
     acting, friction = late(evidence.actuator), rubbing(evidence.friction)
+    searched = (
+        f"the search of {evidence.evaluations} closed loops on the learned dynamics found the largest distance of each "
+        "posterior sample"
+    )
+    if evidence.is_parametric:
+        return complete, alike, f"{_PARAMETRIC} ({in_words(evidence.parameters)})", searched, ANY_ORDER
     if evidence.negligible:
         gaps = with_units(evidence.coverage.resolution)
         beside = f"the largest gaps of the records of states and inputs, where this is not known, are {gaps}"
@@ -228,14 +248,15 @@ def dynamics_assumptions(evidence: Evidence) -> tuple[str, ...]:
         "in gaps of the records, the residual is like what was seen beside them; the largest gaps of states and inputs "
         f"are {with_units(evidence.coverage.resolution)}",
         joint,
-        f"the search of {evidence.evaluations} closed loops on the learned dynamics found the largest distance of each "
-        "posterior sample",
+        searched,
         ANY_ORDER,
     )
 
 
 def condition_on_dynamics(details: Mapping[str, Any]) -> str:
     """Return the condition under which the confidence of a bound from learned dynamics holds."""
+    if details["parameters"]:
+        return " of M's uncertain parameters, if the system is M with other values of them, and errors as recorded"
     physical = details["physical"]
     state, acting = state_of(details["estimated"]), late(details["actuator"])
     acting = f" ({acting})" if acting else ""
@@ -275,6 +296,9 @@ def conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
         noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
         alike = f"the system being deterministic{noise}, and its dynamics {changing}"
     acting, friction = late(details["actuator"]), rubbing(details["friction"])
+    if details["parameters"]:
+        values = in_words(details["parameters"])
+        return [complete, alike, f"M having the right uncertain parameters ({values}), also where no execution was"]
     return [
         complete,
         *([f"the inputs {acting} in every task, as in the executions"] if acting else []),

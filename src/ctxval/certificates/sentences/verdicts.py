@@ -131,7 +131,8 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
     which = "" if quantile is None else f" in at least {100 * quantile:g} % of its executions"
     condition = "confidence, if its assumptions hold"
     if kind == "dynamics":
-        condition = f"probability under a Gaussian process{condition_on_dynamics(details)}"
+        law = "the posterior" if details["parameters"] else "a Gaussian process"
+        condition = f"probability under {law}{condition_on_dynamics(details)}"
     elif kind == "posterior":
         what = "expected distance" if details.get("stochastic") else "distance"
         condition = f"probability under a Gaussian process, if the {what} is as smooth between the trials as at them"
