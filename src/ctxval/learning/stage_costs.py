@@ -337,8 +337,8 @@ class Costs:
         return self.plan(tasks) + 2 * self.run(18 * self.sizes.states, tasks)
 
     def intensified(self, settings: WorstCaseSettings) -> float:
-        """Return the seconds of two searches of four times as many tasks."""
-        tasks = 8 * settings.evaluations
+        """Return the seconds of two intensified searches."""
+        tasks = 2 * settings.intensified(self.sizes.dimension)
         return self.plan(tasks) + self.run(1, tasks)
 
 

@@ -50,6 +50,10 @@ class WorstCaseSettings:
     screened_tasks: int = 1500  # number of tasks in its search on the mean
     further: int = 256  # number of random tasks in a screening if draws differ in the dry friction at rest
 
+    def intensified(self, dimension: int) -> int:
+        """Return the number of tasks of each of two intensified searches."""
+        return self.evaluations * (4 if dimension <= 2 else 1)
+
     @classmethod
     def for_dimension(cls, dimension: int, batched: bool = True) -> WorstCaseSettings:
         """Return settings for so many task parameters; there are far fewer tasks if they are designed one by one."""
@@ -164,9 +168,12 @@ class WorstCaseSearch:
         return distances
 
     def intensified_search(self, posterior: AnyPosterior, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return the largest distances on the mean ``(2,)``, and where, in two searches of four times as many tasks."""
+        """Return the largest distances on the mean ``(2,)``, and where, in two searches of more tasks.
+
+        They have four times as many in one or two dimensions. In more, the usual search has as many already.
+        """
         distance, none = self._on_one(posterior.mean), np.empty((0, self.dimension))
-        evaluations = 4 * self.settings.evaluations
+        evaluations = self.settings.intensified(self.dimension)
         with single_threaded():
             maxima = [search_globally(distance, self.dimension, none, rng, evaluations=evaluations) for _ in range(2)]
         return np.array([maximum.values[0] for maximum in maxima]), np.array([each.points[0] for each in maxima])
