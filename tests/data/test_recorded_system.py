@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ctxval import Task, Trajectory, systems
+from ctxval import Campaign, Task, TaskSuite, Trajectory, Validation, controllers, distances, models, systems
+from ctxval.core.trajectory import COMPLETE
 from ctxval.data import LogMapping
 from ctxval.data.recordings import RecordedInputsWarning
 from ctxval.errors import ExecutionError, InputError
@@ -86,3 +88,29 @@ def test_a_log_with_a_gap_is_no_execution(tmp_path: Path) -> None:
     (tmp_path / "lift.json").write_text(json.dumps(rows))
     with refuses(InputError, "lift.json", 2):
         systems.Recorded(tmp_path, MAPPING)
+
+
+def test_a_recording_that_a_safety_limit_ended_is_an_outcome() -> None:
+    stopped = systems.Recorded({"lift": RUN}, stopped_by="a safety limit").execute(constant, task("lift", 8))
+    assert stopped.is_outcome
+    assert stopped.horizon == 5
+    whole = systems.Recorded({"lift": RUN}, stopped_by="a safety limit").execute(constant, task("lift", 4))
+    assert whole.ended == COMPLETE
+    fallen = systems.Recorded({"lift": replace(RUN, ended="terminated: it fell")}).execute(constant, task("lift", 8))
+    assert fallen.ended == "terminated: it fell"
+
+
+def test_a_model_that_goes_on_is_falsified_by_a_recording_that_was_stopped() -> None:
+    names = ("lift", "turn")
+    validation = Validation(
+        space=TaskSuite(names),
+        task=lambda p: task("", 5),
+        system=systems.Recorded({"lift": RUN, "turn": RUN.first(3)}, stopped_by="a safety limit"),
+        model=models.Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]]),
+        synthesizer=controllers.Policy(lambda t, x, task: np.ones(1)),
+        distance=distances.MaximumDeviation(),
+        start_tolerance=1.0,
+    )
+    campaign = Campaign(validation).run(2, 100.0)
+    assert campaign.verdict(100.0).answer == "falsified"
+    assert {trial.parameters["task"]: trial.state for trial in campaign.trials}["turn"] == "failed"

@@ -19,7 +19,7 @@ from ctxval._util.texts import enumerated
 from ctxval.core.controller import Controller
 from ctxval.core.plan import input_difference, inputs_along
 from ctxval.core.task import Task
-from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.core.trajectory import COMPLETE, TERMINATED, Trajectory, Transitions
 from ctxval.data.log import Clock, Log, Signal, Table
 from ctxval.data.mapping import LogMapping, Observer
 from ctxval.data.rates import Clocked, Column, require_scale
@@ -345,11 +345,17 @@ class Recorded:
             the file without its ending.
         mapping: which fields of the logs are states and inputs, and how long a step is; a table as in a file, or
             :class:`ctxval.data.LogMapping`. Without inputs, they are those that the controller gives along the records.
+        stopped_by: what ended recordings that are shorter than their task, such as "a safety limit". They are then
+            outcomes, as a fall is. If it is empty, they are failed executions.
     """
 
     def __init__(
-        self, runs: Mapping[str, Trajectory] | str | Path, mapping: LogMapping | dict[str, Any] | None = None
+        self,
+        runs: Mapping[str, Trajectory] | str | Path,
+        mapping: LogMapping | dict[str, Any] | None = None,
+        stopped_by: str = "",
     ) -> None:
+        self.stopped_by = stopped_by
         if isinstance(runs, Mapping):
             self.runs = dict(runs)
         else:
@@ -374,12 +380,16 @@ class Recorded:
             known = enumerated(self.runs, 6)
             raise ExecutionError(f"there is no recording of the task {task.name!r}; there are those of {known}")
         run, steps = self.runs[task.name], task.horizon
-        if run.horizon < steps:
+        ended = run.ended if run.horizon <= steps else COMPLETE
+        if run.horizon < steps and self.stopped_by:
+            ended = f"{TERMINATED}: {self.stopped_by}"
+        elif run.horizon < steps and not run.is_outcome:
             raise ExecutionError(f"the recording of {task.name!r} has {run.horizon} steps, and the task has {steps}")
         times, states, inputs = run.times[: steps + 1], run.states[: steps + 1], run.inputs[:steps]
         if not inputs.shape[-1]:
-            return Trajectory(times, states, np.stack(list(inputs_along(controller, task, states[:-1]))))
-        recorded = Trajectory(times, states, inputs)
+            inputs = np.stack(list(inputs_along(controller, task, states[:-1])))
+            return Trajectory(times, states, inputs, ended=ended)
+        recorded = Trajectory(times, states, inputs, ended=ended)
         names = {f"u{i}": "" for i in range(inputs.shape[-1])}
         if difference := input_difference(controller, task, recorded, names):
             warnings.warn(
