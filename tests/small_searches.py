@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from ctxval.certificates import Forecast, Maxima, Sample, draw_maxima, forecast
+from ctxval.certificates import Maxima, Sample, draw_maxima
 from ctxval.certificates.maxima import MaximaSettings
 from ctxval.gp.hyperposterior import draw_paths
 from ctxval.learning.actuators import ActuatorSettings
@@ -20,7 +20,7 @@ drawn: dict[tuple[Any, ...], Maxima] = {}
 
 
 def take_few_draws(replace: Callable[[str, Any], None], *, once: bool = False) -> None:
-    """Make the draws of d* and the futures of forecasts fewer, by a function that replaces an attribute.
+    """Make the draws of d* fewer, by a function that replaces an attribute.
 
     With ``once``, the draws of the same trials are remembered for later tests of the process.
     """
@@ -35,10 +35,6 @@ def take_few_draws(replace: Callable[[str, Any], None], *, once: bool = False) -
             drawn[key] = fewer(sample, draws=draws, **options)
         return drawn[key]
 
-    def shorter(sample: Sample, maxima: Maxima, threshold: float, confidence: float) -> Forecast:
-        return forecast(sample, maxima, threshold, confidence, futures=6)
-
-    replace("ctxval.certificates.posterior.forecast", shorter)
     for module in ("stopping", "posterior", "maxima"):
         replace(f"ctxval.certificates.{module}.draw_maxima", remembered if once else fewer)
     replace("ctxval.certificates.maxima.draw_paths", partial(draw_paths, waves=64))

@@ -46,7 +46,6 @@ from ctxval import (
     report,
     searches,
     systems,
-    testing,
 )
 from ctxval._util.describe import describe
 from ctxval._util.representation import WIDTHS, ShortRepr, shown
@@ -54,6 +53,7 @@ from ctxval.certificates import Certificate, Sample
 from ctxval.core.trial import Change
 from ctxval.errors import InputError
 from facts import assert_names, refuses
+from faulty_rig import FaultyRig
 from rig_thorough import some
 
 PACKAGES = (
@@ -377,7 +377,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.StoppingDecision": lambda: certificates.StoppingDecision(next_point=np.zeros(3)),
     "certificates.StoppingRule": lambda: certificates.StoppingRule(0.5),
     "certificates.Diagnosis": diagnosis,
-    "certificates.Forecast": lambda: certificates.Forecast(12, 0.75, 0.25),
+    "certificates.Forecast": lambda: certificates.Forecast(12, 0.75),
     "certificates.RecoveredFailure": lambda: certificates.RecoveredFailure(3, 7, "fuse replaced"),
     "certificates.Maxima": lambda: certificates.draw_maxima(sample(), draws=12, paths=4),
     "certificates.Sample": sample,
@@ -410,7 +410,6 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "studies.replay.ResidualShare": lambda: replayed().residuals[0],
     "studies.replay.StepError": lambda: replayed().errors[0],
     "studies.replay.Suggestion": lambda: replay.Suggestion("delay", 0.04, 0.5, "the inputs act later"),
-    "testing.FaultyRig": lambda: testing.FaultyRig(systems.Simulated(LINEAR), {3: "raise"}),
 }
 
 INSIDE: dict[str, Callable[[], object]] = {
@@ -689,7 +688,7 @@ def test_trials_become_a_table_of_pandas() -> None:
     plane = ctxval.Validation(
         space=TaskSpace(goal=(-1.0, 1.0, "rad"), distance=([0, 0], [1, 1], "m")),
         task=lambda p: Task([p.goal, 0.0], horizon=5, dt=0.1),
-        system=testing.FaultyRig(systems.Simulated(LINEAR), {1: "raise"}),
+        system=FaultyRig(systems.Simulated(LINEAR), {1: "raise"}),
         model=models.Linear(LINEAR.A, 0.9 * LINEAR.B),
         synthesizer=controllers.LQR([1, 1], [1]),
         distance=distances.FinalState(),

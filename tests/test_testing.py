@@ -15,6 +15,7 @@ from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.errors import ConformanceError
 from facts import refuses
+from faulty_rig import FaultyRig
 
 MODEL = models.Linear([[1.0, 0.1], [-0.2, 0.9]], [[0.0], [0.1]], [0.01, 0.0])
 TASKS = Task([np.linspace(-1, 1, 4), 0.0], goal=[0.5, 0.0], horizon=12, dt=0.1)
@@ -51,7 +52,7 @@ def test_a_wrong_jacobian_is_named() -> None:
 def test_sound_systems_pass() -> None:
     controller = LQR.design(TASKS[0], MODEL)
     testing.check_system(systems.Simulated(MODEL), controller, TASKS[0])
-    testing.check_system(testing.FaultyRig(systems.Simulated(MODEL)), controller, TASKS[0])
+    testing.check_system(FaultyRig(systems.Simulated(MODEL)), controller, TASKS[0])
 
 
 def test_a_system_that_is_not_reset_or_ends_early_is_named() -> None:
@@ -68,7 +69,7 @@ def test_a_system_that_is_not_reset_or_ends_early_is_named() -> None:
     with refuses(ConformanceError, 0.388407):
         testing.check_system(Unreset(), controller, TASKS[0])
     with refuses(ConformanceError, "states", (12, 2)):
-        testing.check_system(testing.FaultyRig(systems.Simulated(MODEL), {0: "short"}), controller, TASKS[0])
+        testing.check_system(FaultyRig(systems.Simulated(MODEL), {0: "short"}), controller, TASKS[0])
 
 
 def test_noise_beyond_the_tolerance_is_named() -> None:
@@ -201,7 +202,7 @@ def test_a_search_that_repeats_failed_points_is_named() -> None:
 
 def test_the_rig_fails_where_it_is_told_to() -> None:
     validation = make_validation()
-    rig = testing.FaultyRig(validation.system, {1: "raise"})
+    rig = FaultyRig(validation.system, {1: "raise"})
     plan = validation.plan([0.5])
     assert rig.execute(plan.controller, plan.task).finite
     with refuses(RuntimeError, "motor"):

@@ -1,21 +1,18 @@
-"""Conformance checks for your own parts, and a system that fails at chosen executions.
+"""Conformance checks for your own parts.
 
 Each check raises :class:`ctxval.errors.ConformanceError` with one sentence if the part breaks its contract.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import ShortRepr
 from ctxval.certificates import Certificate, CertificateKind, Sample
 from ctxval.core.controller import Controller, Synthesizer, converged_of, each_alone
 from ctxval.core.distance import Distance
@@ -181,41 +178,6 @@ def _trial_run(search: Search, dimension: int, seed: int, budget: int) -> tuple[
         search.tell(point, [value])
         points, values = np.concatenate([points, point]), np.append(values, value)
     return points, values
-
-
-Fault = Literal["raise", "nan", "short", "wrong shape"]
-
-
-class FaultyRig(ShortRepr):
-    """A system that runs another one and fails at chosen executions, for tests of how a campaign handles failures.
-
-    Args:
-        faults: the fault of each execution that fails, by its number from 0: ``"raise"``, ``"nan"`` (all states are
-            NaN), ``"short"`` (the last step is missing) or ``"wrong shape"`` (all states but the first are missing).
-        delay: seconds to wait before each execution.
-    """
-
-    def __init__(self, system: System, faults: Mapping[int, Fault] | None = None, delay: float = 0.0) -> None:
-        self.system = system
-        self.faults = dict(faults or {})
-        self.delay = delay
-        self._executions = 0
-
-    def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Run one task, with the fault of this execution if it has one."""
-        fault = self.faults.get(self._executions)
-        self._executions += 1
-        time.sleep(self.delay)
-        if fault == "raise":
-            raise RuntimeError("the motor cut out")
-        whole = self.system.execute(controller, task)
-        if fault == "nan":
-            return Trajectory(whole.times, whole.states * np.nan, whole.inputs)
-        if fault == "short":
-            return Trajectory(whole.times[:-1], whole.states[:-1], whole.inputs[:-1], ended="stopped by the operator")
-        if fault == "wrong shape":
-            return Trajectory(whole.times, whole.states[:, :1], whole.inputs)
-        return whole
 
 
 def _require(condition: bool, sentence: str) -> None:

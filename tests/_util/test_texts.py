@@ -31,7 +31,7 @@ from ctxval._util.texts import (
 from ctxval.campaign.by_hand import read_runs
 from ctxval.campaign.storage.recovery import export, recover
 from ctxval.core.space import TaskSpace
-from ctxval.testing import FaultyRig
+from faulty_rig import FaultyRig
 
 HOSTILE = "\x1b]0;owned\x07\x1b[2J\x9b31m\x7f\u202egnp.exe\u2066\u2028\udc80\r"
 

@@ -26,8 +26,8 @@ from ctxval.errors import (
     StoreMismatchError,
     UnknownNameError,
 )
-from ctxval.testing import FaultyRig
 from facts import refuses
+from faulty_rig import FaultyRig
 
 BY_DISTANCE = CertificateOptions(DistanceBound())
 

@@ -10,7 +10,7 @@ import pytest
 from conftest import interrupt_at_once, make_validation
 from ctxval import Campaign, Validation, cases, searches
 from ctxval.errors import CtxvalError
-from ctxval.testing import FaultyRig
+from faulty_rig import FaultyRig
 from rig_thorough import more
 
 

@@ -12,8 +12,8 @@ from ctxval.cli.config.check import check_experiment
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
 from ctxval.gp.ascent import usual_effort
-from ctxval.testing import FaultyRig
 from facts import assert_names
+from faulty_rig import FaultyRig
 
 pytestmark = pytest.mark.in_full
 

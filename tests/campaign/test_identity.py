@@ -20,8 +20,8 @@ from ctxval.cli import app
 from ctxval.cli.config.settings import read_settings
 from ctxval.errors import DistanceError, InputError, StoreError, StoreMismatchError
 from ctxval.gp.kernels import Matern
-from ctxval.testing import FaultyRig
 from facts import assert_names, refuses
+from faulty_rig import FaultyRig
 from rig_thorough import more
 
 SEARCH = searches.GPUCB

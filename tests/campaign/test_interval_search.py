@@ -49,8 +49,8 @@ from ctxval.core.coverage import UntestedRest, UnvisitedRegion
 from ctxval.errors import InputError
 from ctxval.learning import dynamics_study
 from ctxval.learning.dynamics_posterior import condition
-from ctxval.testing import FaultyRig
 from facts import assert_names, refuses
+from faulty_rig import FaultyRig
 from rig_thorough import more
 
 

@@ -20,10 +20,10 @@ from ctxval import (
     plot,
     searches,
     systems,
-    testing,
 )
 from ctxval.errors import InputError
 from facts import refuses
+from faulty_rig import FaultyRig
 from rig_thorough import more
 
 
@@ -81,7 +81,7 @@ def make_plane() -> Validation:
     return Validation(
         space=TaskSpace(x=(-1, 1, "m"), y=(-1, 1, "m")),
         task=lambda p: Task([p.x, p.y], horizon=5, dt=0.1),
-        system=testing.FaultyRig(systems.Simulated(models.Linear(0.9 * np.eye(2), np.eye(2))), {2: "raise"}),
+        system=FaultyRig(systems.Simulated(models.Linear(0.9 * np.eye(2), np.eye(2))), {2: "raise"}),
         model=models.Linear(0.8 * np.eye(2), np.eye(2)),
         synthesizer=controllers.LQR([1, 1], [1, 1]),
         distance=distances.FinalState(norm=1),

@@ -25,8 +25,8 @@ from ctxval.campaign.choices import Choice
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import ProcessPool
 from ctxval.errors import CampaignError, InputError, ModelError
-from ctxval.testing import FaultyRig
 from facts import assert_names, refuses
+from faulty_rig import FaultyRig
 from rig_thorough import more
 from rig_workers import Logging
 from rig_workers import campaign as logged

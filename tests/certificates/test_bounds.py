@@ -4,7 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctxval.certificates.bounds import as_text, at_most, with_error
+from ctxval._util.texts import as_text
+from ctxval.certificates.bounds import at_most, with_error
 from facts import assert_names
 
 

@@ -114,7 +114,7 @@ def test_an_undecided_verdict_says_how_many_executions_are_needed_and_what_the_s
     fewer = replace(sample(), learned=Learned(replace(GOOD, predictions=GOOD.predictions[:1])))
     certificate = Dynamics(tests=0).certify(replace(fewer, threshold=1.2))
     assert certificate.doubt is not None
-    assert certificate.expected == Forecast(2, 1.0, 0.0, fewest=True)
+    assert certificate.expected == Forecast(2, 1.0)
     needed = "at least 2 more executions are needed to validate it; so far, 100 % of the posterior samples"
     assert needed in str(certificate.expected)
     assert Dynamics(tests=0).certify(replace(sample(), threshold=1.2)).expected is None

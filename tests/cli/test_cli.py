@@ -28,7 +28,7 @@ import sys
 from conftest import make_validation
 from ctxval import Experiment
 from ctxval.core import truth
-from ctxval.testing import FaultyRig
+from faulty_rig import FaultyRig
 
 validation = make_validation()
 

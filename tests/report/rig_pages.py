@@ -23,7 +23,7 @@ from ctxval import (
 )
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
-from ctxval.testing import FaultyRig
+from faulty_rig import FaultyRig
 
 HOSTILE = "</script><script>document.title='hacked'</script><img src=x onerror=alert(1)>"
 """A text that would script a page into which it is put as it is."""

@@ -127,3 +127,18 @@ def parted(label: str) -> tuple[str, str]:
     name, bracket, unit = label.removesuffix("]").rpartition("[")
     is_unit = bracket and label.endswith("]") and not unit.strip().isdigit()
     return (name.strip(), unit.strip()) if is_unit else (label, "")
+
+
+def as_text(value: object) -> str:
+    """Return a number, a list of numbers or a table of numbers as text; floats have four significant digits."""
+    match value:
+        case None:
+            return "-"
+        case float():
+            return f"{value:.4g}"
+        case list() | tuple():
+            return ", ".join(as_text(item) for item in value)
+        case dict():
+            return ", ".join(f"{name} {as_text(item)}" for name, item in value.items())
+        case _:
+            return str(value)

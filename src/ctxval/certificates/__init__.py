@@ -8,7 +8,7 @@ from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, far
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
 from ctxval.certificates.evidence import Evidence, Learned
 from ctxval.certificates.expiry import WatchState
-from ctxval.certificates.forecast import Forecast, forecast
+from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.posterior import Diagnosis, DistanceBound, diagnose, instantaneous_bound
@@ -61,7 +61,6 @@ __all__ = [
     "diagnose",
     "draw_maxima",
     "farthest_task",
-    "forecast",
     "instantaneous_bound",
     "is_validated",
     "judge",

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.special import betainc, betaln
+import scipy
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.checked import Probability, checked
@@ -77,7 +76,7 @@ def anytime_volume(violating: Mask, beta: float) -> float:
     for end in np.flatnonzero(np.append(violating[1:], True)).tolist():
         n, violations = end + 1, int(counts[end])
         if violations < n and excess(high, n, violations) >= 0:
-            root = brentq(excess, max(violations / n, 1e-12), high, args=(n, violations), xtol=1e-12)
+            root = scipy.optimize.brentq(excess, max(violations / n, 1e-12), high, args=(n, violations), xtol=1e-12)
             least = min(least, root * (1 + 1e-9))
     return least
 
@@ -86,7 +85,11 @@ def log_e_value(n: int, violations: int, volume: Array) -> Array:
     """Return ``log E_n`` against the hypothesis that at least this volume violates, shape of ``volume``."""
     k, held = violations, n - violations
     with np.errstate(divide="ignore"):
-        uniform = np.log1p(-_NO_VIOLATION) + betaln(k + 1, held + 1) + np.log(betainc(k + 1, held + 1, volume))
+        uniform = (
+            np.log1p(-_NO_VIOLATION)
+            + scipy.special.betaln(k + 1, held + 1)
+            + np.log(scipy.special.betainc(k + 1, held + 1, volume))
+        )
         uniform = uniform - (k + 1) * np.log(volume) - held * np.log1p(-volume)
     if k:
         return np.asarray(uniform)

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from ctxval._util.registry import Registry
 from ctxval._util.representation import ShortRepr, Shown, call, line, lines
+from ctxval._util.texts import as_text
 from ctxval._util.version import VERSION
-from ctxval.certificates.bounds import ERRORS, as_text, at_most, with_error
+from ctxval.certificates.bounds import ERRORS, at_most, with_error
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences import verdicts as sentences
 from ctxval.certificates.sentences.statements import ONE_CAMPAIGN

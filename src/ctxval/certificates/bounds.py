@@ -162,18 +162,3 @@ class Quantities:
 
 
 NO_UNITS = Quantities()
-
-
-def as_text(value: object) -> str:
-    """Return a number, a list of numbers or a table of numbers as text; floats have four significant digits."""
-    match value:
-        case None:
-            return "-"
-        case float():
-            return f"{value:.4g}"
-        case list() | tuple():
-            return ", ".join(as_text(item) for item in value)
-        case dict():
-            return ", ".join(f"{name} {as_text(item)}" for name, item in value.items())
-        case _:
-            return str(value)

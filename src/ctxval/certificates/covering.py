@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations, product
 
 import numpy as np
-from scipy.spatial import KDTree
-from scipy.spatial.distance import cdist
-from scipy.special import gammaln
+import scipy
 
 from ctxval._util.arrays import Array
 
@@ -25,7 +23,9 @@ _NEXT_TO = 0.125
 def resolved_volume(resolution: float, dimension: int) -> float:
     """Return the volume of a ball as a share of the unit cube, at most 1; its radius is in diagonals of the cube."""
     radius = resolution * np.sqrt(dimension)
-    log_volume = 0.5 * dimension * np.log(np.pi) - gammaln(0.5 * dimension + 1) + dimension * np.log(radius)
+    log_volume = (
+        0.5 * dimension * np.log(np.pi) - scipy.special.gammaln(0.5 * dimension + 1) + dimension * np.log(radius)
+    )
     return float(np.exp(min(log_volume, 0.0)))
 
 
@@ -65,7 +65,7 @@ def covering(X: Array, resolution: float, most: int) -> Array | None:
 def most_contested(points: Array, X: Array, resolution: float) -> Array | None:
     """Return which of the points ``(k, d)`` is near many others and far from every trial; None if none is."""
     gaps = _gaps(X, points)
-    near = (cdist(points, points) / np.sqrt(X.shape[1]) <= resolution / 2).sum(axis=1)
+    near = (scipy.spatial.distance.cdist(points, points) / np.sqrt(X.shape[1]) <= resolution / 2).sum(axis=1)
     best = int((gaps * near).argmax())
     return points[best] if gaps[best] > _NEXT_TO * resolution else None
 
@@ -106,5 +106,5 @@ def _probes(d: int) -> Array:
 
 
 def _gaps(X: Array, probes: Array) -> Array:
-    distances, _ = KDTree(X).query(probes)
+    distances, _ = scipy.spatial.KDTree(X).query(probes)
     return np.asarray(distances / np.sqrt(X.shape[1]))

@@ -95,7 +95,7 @@ class Dynamics(CertificateKind):
             # Missing tests matter only to a bound that suffices.
             certificate = replace(certificate, doubt=None, withdrawn_by=None)
         kept = float((evidence.maxima <= threshold).mean())
-        return replace(certificate, expected=Forecast(fewest_missing(evidence), kept, 1 - kept, fewest=True))
+        return replace(certificate, expected=Forecast(fewest_missing(evidence), kept))
 
     def needs_evidence(self, sample: Sample) -> bool:
         """Return whether all trials have a distance."""

@@ -20,7 +20,7 @@ from itertools import combinations, product
 from typing import Any
 
 import numpy as np
-from scipy.spatial.distance import cdist
+import scipy
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.files import MADE_BY
@@ -96,7 +96,7 @@ class Surfaces:
         points = points * scales
         tail = np.concatenate([np.ones((K, 1)), points], axis=1)
         matrix = np.zeros((K + 1 + d, K + 1 + d))
-        matrix[:K, :K] = cdist(points, points) ** 3 + SHAPE.nugget * np.eye(K)
+        matrix[:K, :K] = scipy.spatial.distance.cdist(points, points) ** 3 + SHAPE.nugget * np.eye(K)
         matrix[:K, K:], matrix[K:, :K] = tail, tail.T
         inverse = np.linalg.inv(matrix)
         weights = inverse[:, :K] @ values

@@ -34,7 +34,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
-from scipy.special import gammaln
+import scipy
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
@@ -86,9 +86,15 @@ class KnownStatistics:
         if self.freedom is not None:
             k = 40.0  # runs that prior knowledge of noise weighs as much as
             # Standard deviation of the logarithm of m around what is known beforehand.
-            prior = a * k * math.log(k) - gammaln(a * k) - 0.5 * (np.log(CHANGES.freedoms / self.freedom) / 0.5) ** 2
+            prior = (
+                a * k * math.log(k)
+                - scipy.special.gammaln(a * k)
+                - 0.5 * (np.log(CHANGES.freedoms / self.freedom) / 0.5) ** 2
+            )
         scale = -a * (K + k) * np.log(self.sums + k)[..., None]
-        return np.asarray(prior + gammaln(a * (K + k)) - K * gammaln(a) + scale + a * self.logs[..., None])
+        return np.asarray(
+            prior + scipy.special.gammaln(a * (K + k)) - K * scipy.special.gammaln(a) + scale + a * self.logs[..., None]
+        )
 
     def with_value(self, value: Array) -> KnownStatistics:
         """Return what is known with one more value ``(...)``."""

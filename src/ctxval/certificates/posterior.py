@@ -12,11 +12,11 @@ Cook and Weisberg 1982).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.special import ndtri, stdtr
+import scipy
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.checked import PositiveFloat, Probability, checked
@@ -24,7 +24,6 @@ from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, farthest_task, resolved_volume
-from ctxval.certificates.forecast import forecast
 from ctxval.certificates.maxima import MAXIMA, Maxima, draw_maxima, representative, settle_maxima
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences import statements, withdrawals
@@ -50,7 +49,7 @@ class DistanceBound(CertificateKind):
 
     @checked
     def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
-        """Return the bound that d* stays below with the confidence, and a forecast if it is above the threshold."""
+        """Return the bound that d* stays below with the confidence."""
         threshold = sample.threshold
         far = (farthest := farthest_task(sample.points)) > self.resolution
         # Many trials that do not cover the tasks are refused before the draws, which take long.
@@ -62,10 +61,7 @@ class DistanceBound(CertificateKind):
             )
         # A bound that is withdrawn in any case need not be told from the threshold.
         drawn = draw_maxima(sample) if threshold is None or far else settle_maxima(sample, threshold, confidence)
-        certificate = self.certify_drawn(sample, drawn, confidence)
-        if threshold is None or certificate.doubt is not None or certificate.upper_bound <= threshold:
-            return certificate  # a process that the trials contradict predicts nothing
-        return replace(certificate, expected=forecast(representative(sample), drawn, threshold, confidence))
+        return self.certify_drawn(sample, drawn, confidence)
 
     @checked
     def certify_drawn(self, sample: Sample, drawn: Maxima, confidence: Probability = 0.95) -> Certificate:
@@ -166,7 +162,7 @@ def diagnose(
     farthest, d, code, doubt = farthest_task(covered), X.shape[1], None, None
     if surprise < LEVEL:
         others = "other trials" if unordered is not None and unordered[worst] else "trials before it"
-        deviations = -ndtri(max(exceed[worst], 1e-300))
+        deviations = -scipy.special.ndtri(max(exceed[worst], 1e-300))
         code, doubt = "surprising", withdrawals.SURPRISING.format(trial=trial, deviations=deviations, others=others)
     elif farthest > resolution:
         missing = covering(covered, resolution, 100)
@@ -187,7 +183,7 @@ def _left_out_exceedances(conditioned: Conditioned) -> Array:
     pull, diagonal = inverse @ y, np.maximum(np.diag(inverse), np.finfo(np.float64).tiny)
     freedom = n - 2
     scale2 = np.maximum(y @ pull - pull**2 / diagonal, np.finfo(np.float64).tiny) / freedom
-    return np.asarray(stdtr(freedom, -pull / np.sqrt(diagonal * scale2)))
+    return np.asarray(scipy.special.stdtr(freedom, -pull / np.sqrt(diagonal * scale2)))
 
 
 def _exceedances(conditioned: Conditioned) -> Array:
@@ -200,7 +196,7 @@ def _exceedances(conditioned: Conditioned) -> Array:
     residuals = (b[1:] - a[1:] * means[:-1]) / np.sqrt(1 + a[1:] ** 2 / precision[:-1])
     freedom = np.arange(1, len(residuals))
     scales = np.sqrt(np.cumsum(residuals**2)[:-1] / freedom)
-    return np.asarray(stdtr(freedom, -residuals[1:] / np.maximum(scales, np.finfo(np.float64).tiny)))
+    return np.asarray(scipy.special.stdtr(freedom, -residuals[1:] / np.maximum(scales, np.finfo(np.float64).tiny)))
 
 
 def _left_out(conditioned: Conditioned) -> float:

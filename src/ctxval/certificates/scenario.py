@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from scipy.special import bdtr, betaincinv
+import scipy
 
 from ctxval._util.checked import NonNegativeInt, PositiveInt, Probability, checked
 from ctxval._util.registry import part
@@ -127,14 +127,14 @@ class SamplingDiscarding(Scenario):
 def tail(n: int, discarded: int, volume: Probability) -> float:
     """Return Pr(V > volume) after n draws of which the k largest are discarded."""
     require_more(n, discarded)
-    return float(bdtr(discarded, n, volume))
+    return float(scipy.special.bdtr(discarded, n, volume))
 
 
 @checked
 def volume_bound(n: int, discarded: int, beta: Probability) -> float:
     """Return the least eps with ``Pr(V > eps) <= beta``."""
     require_more(n, discarded)
-    return float(betaincinv(discarded + 1, n - discarded, 1 - beta))
+    return float(scipy.special.betaincinv(discarded + 1, n - discarded, 1 - beta))
 
 
 @checked

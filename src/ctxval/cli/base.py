@@ -16,30 +16,24 @@ from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from dataclasses import dataclass
 from json import dumps  # code of users may replace what is in a module
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 from rich.table import Table
 
-from ctxval import Trial, Verdict, searches
 from ctxval._util.cores import exits_as_exceptions
 from ctxval._util.describe import describe
 from ctxval._util.files import make_folder_of, require_made_by_us
 from ctxval._util.progress import progress_shown
 from ctxval._util.refusals import reworded
 from ctxval._util.representation import counted
-from ctxval._util.texts import reason_of, shortened
-from ctxval.campaign.goals_of_model import GoalWarning
-from ctxval.campaign.storage.disks import StoreWarning
-from ctxval.certificates import KINDS
-from ctxval.certificates.bounds import as_text
-from ctxval.certificates.sentences import summary
+from ctxval._util.texts import as_text, reason_of, shortened
 from ctxval.cli.commands import TEXTS, Screen, app, line, number_parser
-from ctxval.core.experiment import UnitsWarning
-from ctxval.core.plan import DistanceWarning
-from ctxval.core.trial import Trials
-from ctxval.core.validation import CostWarning
 from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
+
+if TYPE_CHECKING:  # commands that need none of them start earlier
+    from ctxval.certificates.verdict import Verdict
+    from ctxval.core.trial import Trial, Trials
 
 FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED, CUT_OFF = 1, 2, 3, 130, 141
 
@@ -92,20 +86,26 @@ def command(name: str | None = None, /, *, with_json: bool = True, **words: Any)
     return register
 
 
-_WORDS = {
-    "searches": ", ".join(sorted(searches.REGISTRY.built_in)),
-    # The text itself names the kinds that most people need.
-    "certificates": ", ".join(kind for kind in KINDS.built_in if kind not in ("auto", "posterior", "audit")),
-    "volumes": ", ".join(kind for kind in KINDS.built_in if not KINDS.find(kind).bounds_maximum),
-    "target": "CASE|FILE.toml|module:attr",
-}
-"""What the texts of all commands are completed with."""
+@functools.cache
+def _names() -> dict[str, str]:
+    """Return the names of parts that texts of options are completed with."""
+    from ctxval.certificates import KINDS  # imported here, and also below: `ctxval status` starts without them
+    from ctxval.searches import REGISTRY
+
+    return {
+        "searches": ", ".join(sorted(REGISTRY.built_in)),
+        # The text itself names the kinds that most people need.
+        "certificates": ", ".join(kind for kind in KINDS.built_in if kind not in ("auto", "posterior", "audit")),
+        "volumes": ", ".join(kind for kind in KINDS.built_in if not KINDS.find(kind).bounds_maximum),
+    }
 
 
 def _described(parameter: inspect.Parameter, command: str, words: Mapping[str, Any]) -> inspect.Parameter:
     text = {**TEXTS["options"], **TEXTS.get(command, {})}[parameter.name]
-    words = {**_WORDS, **words}
+    words = {"target": "CASE|FILE.toml|module:attr", **words}
     known: dict[str, Any] = {"help": text} if isinstance(text, str) else text
+    if any(f"{{{name}}}" in str(known) for name in ("searches", "certificates", "volumes")):
+        words |= _names()
     known = {key: value.format(**words) if isinstance(value, str) else value for key, value in known.items()}
     known |= number_parser(parameter.annotation)
     if "argument" in known:
@@ -206,7 +206,7 @@ def _in_a_folder() -> bool:
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *place: Any, **_: Any) -> None:
-    if issubclass(category, StoreWarning | UnitsWarning | GoalWarning | DistanceWarning | CostWarning):
+    if category.__module__.startswith("ctxval."):
         err.say(("warning:", "bold yellow"), f" {message}")
     else:
         err.say(warnings.formatwarning(message, category, *place[:2]).rstrip("\n"))
@@ -374,6 +374,8 @@ def print_other_stores(others: list[str]) -> None:
 
 def print_verdict(verdict: Verdict, units: str = "") -> None:
     """Print the answer with its numbers and conditions, on one screen; the report and --json have the whole reason."""
+    from ctxval.certificates.sentences import summary
+
     out.say((verdict.answer.upper(), f"bold {COLOURS[verdict.answer]}"), summary.headline(verdict, units), wrap=True)
     print_table(summary.rows(verdict, units))
     for remark in verdict.remarks if verdict.answer == "validated" else ():

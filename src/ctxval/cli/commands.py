@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import tomllib
 from collections.abc import Iterable, Iterator
@@ -66,7 +67,11 @@ class Commands(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args[0] in MODULES:
-            importlib.import_module(MODULES[args[0]])
+            gc.disable()  # which would look through all that is loaded
+            try:
+                importlib.import_module(MODULES[args[0]])
+            finally:
+                gc.enable()
             self.commands = typer.main.get_group(app).commands
         return super().resolve_command(ctx, args)
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.spatial.distance import cdist
-from scipy.special import erfcx, log_ndtr, ndtr
+import scipy
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.boxes import Box, climb, polish, separated_rows
@@ -68,7 +67,7 @@ class LogExpectedImprovement:
         z = (mean - self.best) / sigma
         # The derivative of log_improvement, Phi(z) / (phi(z) + z Phi(z)).
         near, far = np.maximum(z, _FAR_BELOW), np.minimum(z, _FAR_BELOW)
-        slope = np.where(z > _FAR_BELOW, np.exp(log_ndtr(near) - log_improvement(near)), -far - 2 / far)
+        slope = np.where(z > _FAR_BELOW, np.exp(scipy.special.log_ndtr(near) - log_improvement(near)), -far - 2 / far)
         gradient = (slope * d_mean.T + (1 - z * slope) * d_sigma.T) / sigma
         return np.asarray(log_improvement(z) + np.log(sigma)), np.asarray(gradient.T)
 
@@ -77,9 +76,9 @@ def log_improvement(z: Array) -> Array:
     """Return ``log(phi(z) + z Phi(z))``, the expected improvement of a standard normal variate over ``-z``."""
     z = np.asarray(z, dtype=np.float64)
     near, middle = np.maximum(z, -1.0), np.clip(z, _FAR_BELOW, -1.0)
-    direct = np.log(np.exp(-0.5 * near**2 - _LOG_ROOT_2PI) + near * ndtr(near))
+    direct = np.log(np.exp(-0.5 * near**2 - _LOG_ROOT_2PI) + near * scipy.special.ndtr(near))
     # phi(z) (1 - |z| Phi(z) / phi(z)); erfcx gives the ratio Phi / phi, whose parts would both underflow.
-    ratio = np.sqrt(np.pi / 2) * erfcx(-middle / np.sqrt(2))
+    ratio = np.sqrt(np.pi / 2) * scipy.special.erfcx(-middle / np.sqrt(2))
     scaled = -0.5 * middle**2 - _LOG_ROOT_2PI + np.log1p(middle * ratio)
     far = np.minimum(z, _FAR_BELOW)
     series = -0.5 * far**2 - _LOG_ROOT_2PI - 2 * np.log(-far) + np.log1p(-3 / far**2)
@@ -119,7 +118,7 @@ def maximise(
     others = np.empty((0, dimension)) if away is None else away
 
     def is_apart(points: Array) -> Mask:
-        return np.asarray(cdist(points, others).min(axis=1, initial=np.inf) > 0.02 * diagonal)
+        return np.asarray(scipy.spatial.distance.cdist(points, others).min(axis=1, initial=np.inf) > 0.02 * diagonal)
 
     low, high = (np.zeros(dimension), np.ones(dimension)) if box is None else box
     candidates = low + rng.random((min(2000, 256 * dimension), dimension)) * (high - low)
@@ -142,7 +141,7 @@ def maximise(
         top, _ = polish(lambda Z: acquisition(Z[0])[None], climbed[row], heights[row], (low, high), 2 * dimension)
         climbed = np.concatenate([climbed, top])
     finalists = np.concatenate([climbed, candidates[order[:16]]])
-    is_new = cdist(finalists, known, "chebyshev").min(axis=1, initial=np.inf) > 1e-6
+    is_new = scipy.spatial.distance.cdist(finalists, known, "chebyshev").min(axis=1, initial=np.inf) > 1e-6
     values = np.where(is_new & is_apart(finalists), acquisition(finalists), -np.inf)
     if not np.isfinite(values).any():
         return np.asarray(low + rng.random(dimension) * (high - low))

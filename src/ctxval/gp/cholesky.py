@@ -10,8 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.blas import dtrmm
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
+import scipy
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
@@ -26,19 +25,19 @@ class CholeskyFactor:
 
     def solve(self, right: Array) -> Array:
         """Return ``K^-1 right`` in the shape of ``right``, ``(n,)`` or ``(n, k)``."""
-        return np.asarray(dpotrs(self.L, right, lower=1)[0])
+        return np.asarray(scipy.linalg.lapack.dpotrs(self.L, right, lower=1)[0])
 
     def whiten(self, right: Array) -> Array:
         """Return ``L^-1 right``; if a column of ``right`` has covariance K, that of the result is the identity."""
-        return np.asarray(dtrtrs(self.L, right, lower=1)[0])
+        return np.asarray(scipy.linalg.lapack.dtrtrs(self.L, right, lower=1)[0])
 
     def whiten_many(self, right: Array) -> Array:
         """Return ``L^-1 right`` by the inverse factor, faster for many contiguous columns; they may be overwritten."""
-        return np.asarray(dtrmm(1.0, self.inverse_factor, right, lower=1, overwrite_b=1))
+        return np.asarray(scipy.linalg.blas.dtrmm(1.0, self.inverse_factor, right, lower=1, overwrite_b=1))
 
     def inverse(self) -> Array:
         """Return ``K^-1``, shape ``(n, n)``."""
-        lower = dpotri(self.L, lower=1)[0]  # L is zero above its diagonal, and stays so
+        lower = scipy.linalg.lapack.dpotri(self.L, lower=1)[0]  # L is zero above its diagonal, and stays so
         inverse = lower + lower.T
         inverse.ravel("K")[:: len(inverse) + 1] *= 0.5  # its diagonal
         return np.asarray(inverse)
@@ -64,7 +63,7 @@ def factorise(covariance: Array, noise: float, *, insist: bool = False) -> Chole
     for _ in range(31 if insist else 1):
         noisy = np.array(covariance, order="F")
         noisy.ravel("K")[:: len(noisy) + 1] += noise  # its diagonal
-        L, info = dpotrf(noisy, lower=1, clean=1, overwrite_a=1)
+        L, info = scipy.linalg.lapack.dpotrf(noisy, lower=1, clean=1, overwrite_a=1)
         if not info and not np.isnan(np.trace(L)):  # some LAPACKs let NaN pass
             return CholeskyFactor(np.asarray(L))
         noise *= 10

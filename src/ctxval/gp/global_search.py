@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import separated_rows
@@ -119,7 +119,7 @@ def _prominences(points: Array, heights: Array, rows: Rows) -> Array:
     values = np.arcsinh((np.maximum(heights, finite.min()) - middle) / spread)
     d = points.shape[1]
     count = min(3 * d + 4, len(points))
-    distances, neighbours = KDTree(points).query(points[rows], count)
+    distances, neighbours = scipy.spatial.KDTree(points).query(points[rows], count)
     distances, neighbours = distances.reshape(len(rows), -1)[:, 1:], neighbours.reshape(len(rows), -1)[:, 1:]
     offsets = (points[neighbours] - points[rows][:, None]) / np.maximum(distances[:, -1:, None], 1e-12)
     terms = np.concatenate([np.ones((*offsets.shape[:2], 1)), offsets], axis=2)

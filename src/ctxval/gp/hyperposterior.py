@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.distance import cdist
+import scipy
 
 from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.boxes import climb, farthest_rows, polish
@@ -250,7 +250,7 @@ class Paths:
         slopes = turned @ self.frequencies
         weights = np.repeat(self.corrections.T, q, axis=0)
         lengths = np.exp(known.log_scales)
-        _, falls = Matern(known.nu).profile_and_slope(cdist(flat / lengths, self.X / lengths))
+        _, falls = Matern(known.nu).profile_and_slope(scipy.spatial.distance.cdist(flat / lengths, self.X / lengths))
         pulls = weights * falls
         slopes += ((pulls @ self.X - pulls.sum(axis=1)[:, None] * flat) / lengths**2).reshape(s, q, d)
         scales = self.scales[:, None]

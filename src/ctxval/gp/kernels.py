@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.spatial.distance import cdist
+import scipy
 
 from ctxval._util.arrays import Array
 from ctxval.errors import InputError
@@ -63,7 +63,7 @@ class Matern(Covariance):
         scaled, centred = Z / scales, (Z - _CENTRE).T
 
         def covariances(X: Array) -> Array:
-            s = cdist(X / scales, scaled)
+            s = scipy.spatial.distance.cdist(X / scales, scaled)
             s *= np.sqrt(2 * self.nu)
             covariance: Array = np.exp(-s)
             covariance *= self._polynomial(s)
@@ -84,7 +84,7 @@ class Matern(Covariance):
         """Return ``sum_ij W_ij dK_ij/dtheta`` for K = k(X, X) and a symmetric W, in the shape of theta."""
         variance, scales, constant, slope = self._parts(theta)
         Y = X / scales
-        r = cdist(Y, Y)
+        r = scipy.spatial.distance.cdist(Y, Y)
         profile, fall = self.profile_and_slope(r)
         by_variance = variance * np.vdot(W, profile)
         # dk/d log l_j = fall(r) * (y_ij - y_kj)^2; the sum over pairs is a quadratic form, without (n, n, d) storage.
@@ -103,7 +103,7 @@ class Matern(Covariance):
         """Return ``dk(x_i, z_j)/dx_i``, shape ``(n, m, d)``."""
         variance, scales, _, slope = self._parts(theta)
         Y, V = X / scales, Z / scales
-        fall = variance * self.profile_and_slope(cdist(Y, V))[1]
+        fall = variance * self.profile_and_slope(scipy.spatial.distance.cdist(Y, V))[1]
         gradient = -fall[:, :, None] * (Y[:, None, :] - V[None, :, :]) / scales
         return np.asarray(gradient if self.linear is None else gradient + slope * (Z - _CENTRE))
 

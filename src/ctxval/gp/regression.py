@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
@@ -196,5 +196,5 @@ def most_likely(
         starts = starts[[np.argmin([negative(start)[0] for start in starts])]]
     limits: Any = {"maxiter": iterations, **({} if tolerance is None else {"ftol": tolerance})}
     settings: Any = {"jac": True, "method": "L-BFGS-B", "bounds": bounds, "options": limits}
-    climbs = [minimize(negative, start, **settings) for start in starts]
+    climbs = [scipy.optimize.minimize(negative, start, **settings) for start in starts]
     return np.asarray(min(climbs, key=lambda climb: float(climb.fun)).x)

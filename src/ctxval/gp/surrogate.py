@@ -6,7 +6,7 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.distance import cdist
+import scipy
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import farthest_rows
@@ -169,7 +169,7 @@ def kept_rows(points: Array, values: Array, count: int, long: int = 1000) -> Row
     largest = np.argsort(-np.nan_to_num(values, nan=-np.inf), kind="stable")[: count // 4]
     latest = np.arange(len(values) - count // 4, len(values))
     chosen = np.unique(np.concatenate([largest, latest]))
-    gaps = cdist(points, points[chosen], "sqeuclidean").min(axis=1)
+    gaps = scipy.spatial.distance.cdist(points, points[chosen], "sqeuclidean").min(axis=1)
     gaps[chosen] = -np.inf
     others = farthest_rows(points, gaps, count - len(chosen), squared=True)
     return np.sort(np.concatenate([chosen, np.array(others, dtype=np.intp)]))

@@ -10,8 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.distance import cdist
-from scipy.special import expit
+import scipy
 
 from ctxval._util.arrays import Array
 
@@ -87,7 +86,7 @@ def monomials(powers: Array) -> SmoothMap:
 
 ACTIVATIONS: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array]]] = {
     "identity": (lambda z: z, np.ones_like),
-    "logistic": (expit, lambda a: a * (1 - a)),
+    "logistic": (scipy.special.expit, lambda a: a * (1 - a)),
     "tanh": (np.tanh, lambda a: 1 - a * a),
     "relu": (lambda z: np.maximum(z, 0.0), lambda a: (a > 0).astype(np.float64)),
 }
@@ -194,11 +193,11 @@ def matern(length_scale: Array | float, nu: float) -> Kernel:
     """Return the Matern kernel of smoothness 1/2, 3/2, 5/2, or infinity: ``exp(-d^2 / 2)``, d in length-scales."""
 
     def squared_exponential(Z: Array, X: Array) -> tuple[Array, Slopes]:
-        K = np.exp(-0.5 * cdist(Z / length_scale, X / length_scale, "sqeuclidean"))
+        K = np.exp(-0.5 * scipy.spatial.distance.cdist(Z / length_scale, X / length_scale, "sqeuclidean"))
         return K, lambda: [(K, 1.0, np.asarray(length_scale) ** -2.0)]
 
     def kernel(Z: Array, X: Array) -> tuple[Array, Slopes]:
-        r = np.sqrt(2 * nu) * cdist(Z / length_scale, X / length_scale)
+        r = np.sqrt(2 * nu) * scipy.spatial.distance.cdist(Z / length_scale, X / length_scale)
         decay = np.exp(-r)
         polynomial = {0.5: 1.0, 1.5: 1 + r, 2.5: 1 + r + r**2 / 3}[nu]
 

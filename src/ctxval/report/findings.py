@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr, counted
@@ -125,7 +125,7 @@ def tasks_covered(context: ReportContext) -> Answer | None:
 def share_far_from_trials(points: Array) -> float:
     """Return the share of the tasks that are farther than the resolution from every trial."""
     d = points.shape[1]
-    gaps, _ = KDTree(points).query(np.random.default_rng(0).random((4096, d)))
+    gaps, _ = scipy.spatial.KDTree(points).query(np.random.default_rng(0).random((4096, d)))
     return float(np.mean(gaps / np.sqrt(d) > RESOLUTION))
 
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from scipy.spatial.distance import cdist
+import scipy
 
 from ctxval._util.arrays import Array, Mask, single_threaded
 from ctxval._util.checked import NonNegativeFloat, PositiveInt, Seconds
@@ -239,8 +239,8 @@ class TrustRegion(SequentialSearch):
 
     def _is_new(self, points: Array, history: _History) -> Mask:
         known, reach = np.isfinite(history.values), 0.05 * np.sqrt(self.dimension)
-        gaps = cdist(points, history.points[known], "chebyshev").min(axis=1, initial=np.inf)
-        others = cdist(points, history.others).min(axis=1, initial=np.inf)
+        gaps = scipy.spatial.distance.cdist(points, history.points[known], "chebyshev").min(axis=1, initial=np.inf)
+        others = scipy.spatial.distance.cdist(points, history.others).min(axis=1, initial=np.inf)
         return np.asarray((gaps > 1e-6) & (others > reach))
 
     def _state(self, history: _History) -> _Region:

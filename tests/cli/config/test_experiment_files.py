@@ -26,8 +26,8 @@ from ctxval.cli.config.parts import TaskTable, part, recorded
 from ctxval.cli.config.settings import ExperimentSettings, read_settings
 from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import CtxvalError, ExecutionError, InputError
-from ctxval.testing import FaultyRig
 from facts import assert_names, is_named, refuses, warns
+from faulty_rig import FaultyRig
 from rig_thorough import more
 
 

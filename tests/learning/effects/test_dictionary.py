@@ -10,7 +10,8 @@ import pytest
 from ctxval import Array, Task, controllers, models, systems
 from ctxval.core.model import Model, memory_in, run_of
 from ctxval.core.rollout import rollout
-from ctxval.learning import effects
+from ctxval.core.trajectory import Transitions
+from ctxval.learning import effects, learn_posterior
 from ctxval.learning.effects import EffectCandidate, ModelWithEffects
 from ctxval.learning.effects.dictionary import candidates, kinds
 from ctxval.learning.effects.plant import plant_of
@@ -118,3 +119,22 @@ def test_a_closed_loop_on_the_model_with_memory_is_its_execution(chosen: tuple[A
     model = ModelWithEffects(LINEAR, chosen, 1)
     looped = rollout(run_of(model, np.array([0.4, 0.0])), controller, task)
     np.testing.assert_allclose(looped.states, model.execute(controller, task).states, rtol=1e-12)
+
+
+def test_draws_of_effects_act_around_draws_of_the_residual() -> None:
+    rng = np.random.default_rng(0)
+    x, u = rng.normal(size=(60, 2)), rng.normal(size=(60, 1))
+    missed = np.stack([0 * x[:, 0], -0.02 * np.sin(2 * x[:, 0])], axis=-1)
+    posterior = learn_posterior(LINEAR, Transitions(x, u, LINEAR.step(x, u) + missed), np.arange(60) // 20)
+    assert posterior is not None
+    residuals = posterior.draw(posterior.data.pairs, rng, 1)
+    column = np.linspace(0.1, 0.4, len(residuals))[:, None]
+    chosen = effects.Delay((3 * column,)), effects.Coulomb((column,), effects.Joint(1, 0, 0.5, 0), 0.1, DT)
+    together = ModelWithEffects(residuals, chosen, 1)
+    begun, inputs = rng.normal(size=(len(residuals), TASKS, 2)), rng.normal(size=(STEPS, len(residuals), TASKS, 1))
+    states, k = loop(together, begun, inputs), len(residuals) // 2
+    sizes = [[float(size[k, 0]) for size in each.sizes] for each in chosen]
+    numbers = tuple(each.with_sizes(few) for each, few in zip(chosen, sizes, strict=True))
+    alone, some = ModelWithEffects(residuals[[k]], numbers, 1), together[np.array([0, k])]
+    np.testing.assert_allclose(loop(some, begun[[0, k]], inputs[:, [0, k]]), states[:, [0, k]], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(states[:, k], loop(alone, begun[k], inputs[:, k]), rtol=1e-9, atol=1e-12)

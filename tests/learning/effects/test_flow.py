@@ -95,3 +95,9 @@ def test_a_smooth_model_is_interpolated_to_the_third_order(part: float) -> None:
 
     assert error(0.2) < 1e-3
     assert error(0.05) < 1.6 * error(0.1) / 8 + 1e-9  # with the third power of dt
+
+
+def test_a_step_that_diverged_ends_where_the_model_ends() -> None:
+    first = np.array([1e8, 1e-4])  # a product of vectors: nothing can be inverted
+    model, x = models.Linear(np.outer(first, first), [[0.0], [1.0]]), np.array([0.3, 1.0])
+    np.testing.assert_allclose(Flow.of(model, x, np.array([0.5])).end(), model.step(x, np.array([0.5])), rtol=1e-9)

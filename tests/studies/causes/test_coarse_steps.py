@@ -23,6 +23,7 @@ from ctxval import (
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.core.trajectory import Trajectory
+from ctxval.learning import effects
 from ctxval.learning.effects.transport import SeeingLate
 from ctxval.studies.causes import CauseReport, find_causes
 from facts import assert_names
@@ -81,6 +82,23 @@ def test_an_imperfect_system_has_the_sizes_that_are_named(name: str, imperfect: 
     model = models.Linear([[1.0, 0.1], [-0.2, 0.9]], [[0.005], [0.1]])
     report = found(systems.Imperfect(model, **imperfect), model, 0.1, 25)
     assert sizes(report, name) == pytest.approx((size,), rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("effect", "close"),
+    [
+        (effects.RateLimit((4.0,), 0, 0.1), (1e-4,)),
+        (effects.InputDrift((0.3,), 0, 0.1), (1e-4,)),
+        # What is added at rest follows from the pushes that a joint withstood, and from those that moved it.
+        (effects.FrictionAtRest((0.2, 0.15), effects.Joint(1, 0, 0.5, 0), 0.1, 0.1, 1e-6), (0.01, 0.3)),
+    ],
+)
+def test_limits_of_rates_drifts_and_friction_at_rest_are_named(effect: Any, close: tuple[float, ...]) -> None:
+    model = models.Linear([[1.0, 0.1], [-0.2, 0.9]], [[0.005], [0.1]])
+    report = found(effects.ModelWithEffects(model, (effect,)), model, 0.1, 40)
+    pairs = zip(sizes(report, effect.name), effect.sizes, close, strict=True)
+    assert all(size == pytest.approx(true, rel=rel) for size, true, rel in pairs)
 
 
 class InParts:

@@ -201,7 +201,8 @@ class OfInput(Effect):
     @classmethod
     def of_input(cls, k: int, most: float, observed: Observed) -> EffectCandidate:
         """Return the candidate of an input, whose largest magnitude is given."""
-        raise NotImplementedError
+        size = Parameter(cls.name, 0.0, most, 0.02 * most, observed.plant.inputs[k][1])
+        return of_size(cls((0.0,), k), size, *(share * most for share in (0.01, 0.05, 0.15)))
 
     def remembered(self, inputs: int) -> int:
         return int(self.holds)

@@ -44,7 +44,10 @@ class Linearisation(ShortRepr):
         held, grown = moved, unit + A @ moved
         for _ in range(PARTS.bit_length() - 1):
             held, grown = held + grown @ held, grown @ grown
-        return cls(A, np.asarray(np.linalg.inv(held), dtype=np.float64))
+        driven = _inverse(held)
+        # In states of a loop that diverged, a step may have no flow but a straight line.
+        flows = (np.abs(held @ driven - unit) < 1e-6).all(axis=(-2, -1), keepdims=True)
+        return cls(np.where(flows, A, 0.0), np.where(flows, driven, unit))
 
     def __getitem__(self, rows: Rows) -> Linearisation:
         """Return that at some of the states; a linear model has the same everywhere."""
@@ -121,7 +124,17 @@ def _moved(A: Array, h: float | Array) -> Array:
     """Return the change of the state by a unit of its derivative, in a part h of a step: the Pade approximation."""
     h = np.asarray(h)[..., None, None]
     z, unit = h * A, np.eye(A.shape[-1])
-    return np.asarray(h * np.linalg.inv(unit - z / 2 + z @ z / 12))
+    return h * _inverse(unit - z / 2 + z @ z / 12)
+
+
+def _inverse(matrices: Array) -> Array:
+    """Return the inverses of matrices ``(..., n, n)``; NaN if one has none."""
+    try:
+        return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        regular = (np.abs(np.linalg.slogdet(matrices).sign) > 0)[..., None, None]
+        inverses = np.linalg.inv(np.where(regular, matrices, np.eye(matrices.shape[-1])))
+        return np.where(regular, inverses, np.nan)
 
 
 def logarithm(J: Array) -> Array:

@@ -17,6 +17,7 @@ from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError
+from ctxval.learning.draws import Draws
 from ctxval.learning.effects.effect import Effect
 from ctxval.learning.effects.flow import Flow, Linearisation
 from ctxval.models import MuJoCo
@@ -50,31 +51,26 @@ class ModelWithEffects(ShortRepr):
     @functools.cached_property
     def draws(self) -> int:
         """The number of draws; 0 if all sizes are numbers."""
-        return max(
-            (len(size) for each in self.effects for size in each.sizes if isinstance(size, np.ndarray)), default=0
-        )
+        sizes = (size for each in self.effects for size in each.sizes if isinstance(size, np.ndarray))
+        return max(map(len, sizes), default=0)
 
     def __getitem__(self, rows: Rows) -> ModelWithEffects:
         """Return some draws."""
         sizes = ([size[rows] if isinstance(size, np.ndarray) else size for size in each.sizes] for each in self.effects)
-        return replace(self, effects=tuple(each.with_sizes(few) for each, few in zip(self.effects, sizes, strict=True)))
+        few = tuple(each.with_sizes(some) for each, some in zip(self.effects, sizes, strict=True))
+        return replace(self, given=self.given[rows] if isinstance(self.given, Draws) else self.given, effects=few)
 
     @functools.cached_property
     def _one_by_one(self) -> tuple[ModelWithEffects, ...]:
         """The draws, with numbers as sizes, if they have models of MuJoCo of their own; empty otherwise."""
-        changing = [each for each in self.effects if type(each).model is not Effect.model]
-        sizes = [size for each in changing for size in each.sizes if isinstance(size, np.ndarray)]
-        if not sizes or not isinstance(self.given, MuJoCo):
+        changing = [size for each in self.effects if type(each).model is not Effect.model for size in each.sizes]
+        if not isinstance(self.given, MuJoCo) or not any(isinstance(size, np.ndarray) for size in changing):
             return ()
 
-        def number(size: float | Array, k: int) -> float:
-            return float(size[k, 0] if isinstance(size, np.ndarray) else size)
+        def alone(effect: Effect, k: int) -> Effect:
+            return effect.with_sizes([size[k, 0] if isinstance(size, np.ndarray) else size for size in effect.sizes])
 
-        draws = (
-            [each.with_sizes([number(size, k) for size in each.sizes]) for each in self.effects]
-            for k in range(len(sizes[0]))
-        )
-        return tuple(replace(self, effects=tuple(effects)) for effects in draws)
+        return tuple(replace(self, effects=tuple(alone(each, k) for each in self.effects)) for k in range(self.draws))
 
     @functools.cached_property
     def _inside(self) -> list[Effect]:

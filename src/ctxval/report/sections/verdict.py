@@ -7,7 +7,8 @@ import shlex
 from markupsafe import Markup
 
 from ctxval._util.representation import counted
-from ctxval.certificates.bounds import as_text, at_most, with_error
+from ctxval._util.texts import as_text
+from ctxval.certificates.bounds import at_most, with_error
 from ctxval.report import markup
 from ctxval.report.context import ReportContext
 from ctxval.report.distance_model import distance_of
