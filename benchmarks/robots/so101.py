@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
-from ctxval import Array, Experiment, Labels, Parameters, Task, TaskSuite, Validation, distances, models, systems
-from ctxval.controllers import Policy
+from ctxval import Array, Experiment, Labels, TaskSuite, Validation, distances, models, systems
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data import LogMapping, read_recordings
@@ -146,11 +145,6 @@ def learned(folder: Path, kind: str, seed: int) -> Model:
     return linear(runs) if kind == "linear" else physical(runs)
 
 
-def commanded(t: int, x: Array, task: Task) -> Array:
-    """Return the commands of a motion, which do not depend on the state."""
-    return np.broadcast_to(task.reference[..., t, :], x.shape)
-
-
 def extent(run: Trajectory, joints: Sequence[int]) -> dict[str, float]:
     """Return the parameters of a motion in the suite: the largest range and the largest rate of its commands."""
     commands = run.inputs[:, list(joints)]
@@ -168,18 +162,14 @@ def validation(folder: Path, model: Model, motions: Sequence[str], joint: int | 
         runs = {name: of_joint(run, joint) for name, run in runs.items()}
     names = JOINTS if joint is None else (JOINTS[joint],)
 
-    def task(p: Parameters) -> Task:
-        run = runs[str(p.task)]
-        reference = np.concatenate([run.inputs, run.inputs[-1:]])
-        return Task(run.states[0], reference=reference, horizon=run.horizon, dt=DT)
-
+    recorded = systems.Recorded(runs)  # whose commands are all that is known of the controller
     extents = {name: extent(run, joints) for name, run in runs.items()}
     return Validation(
         space=TaskSuite(extents, {"range": "rad", "rate": "rad/s"}) if joint is None else TaskSuite(list(runs)),
-        task=task,
-        system=systems.Recorded(runs),
+        task=recorded.task,
+        system=recorded,
         model=model,
-        synthesizer=Policy(commanded),
+        synthesizer=recorded,
         distance=distances.MaximumDeviation(norm=np.inf, components=joints),
         labels=Labels(
             (*(f"{name} [rad]" for name in names), *(f"{name} rate [rad/s]" for name in names)),

@@ -20,7 +20,7 @@ import numpy as np
 from ctxval import Campaign, Task, TaskSuite, Validation
 from ctxval._util.arrays import Array, single_threaded
 from ctxval.core.controller import started
-from ctxval.data.recordings import RecordedInputsWarning
+from ctxval.data.recorded_system import RecordedInputsWarning
 from ctxval.studies.causes import find_causes
 from ctxval.studies.causes.find import CauseSettings
 from json_lines import JsonLines
@@ -115,7 +115,7 @@ def cause_of_joint(folder: Path, seed: int, joint: int) -> dict[str, Any]:
     others = sorted(set(so101.recordings(folder)) - set(five) - set(executed))
     model = so101.linear([so101.recordings(folder)[name] for name in five], joint)
     known, unknown = (so101.validation(folder, model, motions, joint) for motions in (executed, others))
-    return explained(known, unknown, seed, most=1)  # two together would take ten minutes for each joint
+    return explained(known, unknown, seed)
 
 
 def cause_of_pendulum(folder: Path, model: str, seconds: float) -> dict[str, Any]:
@@ -131,11 +131,11 @@ def cause_of_pendulum(folder: Path, model: str, seconds: float) -> dict[str, Any
     return explained(known, unknown, 0)
 
 
-def explained(known: Validation, unknown: Validation, seed: int, most: int = 2) -> dict[str, Any]:
-    """Return the cause that all executions of one suite show, and the largest distances of another with the repair."""
+def explained(known: Validation, unknown: Validation, seed: int) -> dict[str, Any]:
+    """Return the one cause that executions of one suite show, and the largest distances of another with the repair."""
     started, before = time.process_time(), all_distances(unknown)
     campaign = Campaign(known, seed=seed).run(len(all_distances(known)), 1e3, thinking=1.0)
-    report = find_causes(campaign, most=most, settings=CauseSettings(executions=4))
+    report = find_causes(campaign, most=1, settings=CauseSettings(executions=4))
     found = {"named": report.named, "sentence": report.sentence, "before": float(before.max())}
     if report.repaired is not None:
         after = all_distances(unknown.with_parts(model=report.repaired))
