@@ -113,7 +113,12 @@ def test_all_brings_every_extra_and_each_is_used() -> None:
     brought = set(re.findall(r"[a-z]+", given["all"][0].partition("[")[2]))
     assert brought == set(given) - {"all", "test", "docs", "dev", "torch"}  # torch is too large to come along
     source = "".join(file.read_text() for file in (ROOT / "src").rglob("*.py"))
-    imported = {"scikit-learn": "sklearn", "dask": "distributed", "python-multipart": "python_multipart"}
+    imported = {
+        "scikit-learn": "sklearn",
+        "pyyaml": "yaml",
+        "dask": "distributed",
+        "python-multipart": "python_multipart",
+    }
     for extra in brought:
         names = [re.split(r"[\[><=]", requirement)[0] for requirement in given[extra]]
         for name in names:

@@ -3,7 +3,6 @@
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic, WholeSuite
 from ctxval.certificates.base import KINDS, Certificate, CertificateKind, require_use
-from ctxval.certificates.convergence import is_validated, rate
 from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, farthest_task, most_contested
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
 from ctxval.certificates.evidence import Evidence, Learned
@@ -62,11 +61,9 @@ __all__ = [
     "draw_maxima",
     "farthest_task",
     "instantaneous_bound",
-    "is_validated",
     "judge",
     "judge_by",
     "most_contested",
-    "rate",
     "require_learned",
     "require_use",
     "samples_needed",

@@ -86,7 +86,7 @@ def monomials(powers: Array) -> SmoothMap:
 
 ACTIVATIONS: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array]]] = {
     "identity": (lambda z: z, np.ones_like),
-    "logistic": (scipy.special.expit, lambda a: a * (1 - a)),
+    "logistic": (lambda z: np.asarray(scipy.special.expit(z)), lambda a: a * (1 - a)),
     "tanh": (np.tanh, lambda a: 1 - a * a),
     "relu": (lambda z: np.maximum(z, 0.0), lambda a: (a > 0).astype(np.float64)),
 }
