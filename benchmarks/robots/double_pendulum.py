@@ -242,4 +242,4 @@ def experiment(folder: str, seed: int = 0, model: str | float = "1.0", seconds: 
     if name not in PUBLISHED and name not in LEARNED:
         raise InputError(f"model must be one of {', '.join([*PUBLISHED, *LEARNED])}, got {name!r}.")
     chosen = PUBLISHED[name] if name in PUBLISHED else learned(Path(folder), name)
-    return Experiment(f"double pendulum, model {name}", validation(Path(folder), chosen, seconds))
+    return Experiment(f"double pendulum, model {name}", validation(Path(folder), chosen, seconds), budget=10)

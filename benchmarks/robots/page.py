@@ -6,26 +6,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ctxval.report import Card, CardVerdict
-from json_lines import JsonLines
+from ctxval.report import Card
 from page_tables import DOCS, GeneratedPage, Table, reflowed, table
 from robots import double_pendulum
-from robots.study import CAMPAIGNS, CAUSES, CERTIFIED, FALSE_ALARMS, KINDS, REPEATS, RESULTS, SECONDS, SHARES, WATCHED
+from robots.cards import all_cards, cause, of_arm, repair, spread, worst_motions
+from robots.study import CAMPAIGNS, CAUSES, CERTIFIED, FALSE_ALARMS, KINDS, REPEATS, SECONDS, SHARES, WATCHED
 
-SERVO = JsonLines(RESULTS / "servo.jsonl", ("model", "share", "seed"))
-SERVO_CAUSES = JsonLines(RESULTS / "causes_servo.jsonl", ("rule", "seed"))
-SERVO_REFINED = JsonLines(RESULTS / "servo_refined.jsonl", ("model", "half"))
 CARDS = DOCS / "tables" / "robots-cards.json"
-
-OF_ARM = "recordings: SAGE, Apache-2.0"
-OF_PENDULUM = "recordings: DFKI, BSD-3-Clause"
-OF_SERVO = "model and recordings: Rhoban, Apache-2.0"
-LARGEST = "largest deviation of {}"
 
 SOURCES = (
     ("SO-101 arm", "isaac-sim2real/sage", "4ffd262", "Apache-2.0", "output/real/so101/custom"),
@@ -56,7 +48,8 @@ d\\* is the largest distance of all recordings of the suite. For the arm, models
 ## Repeat a row
 
 Save the recordings in a folder, say FOLDER, in the form that is described below, and run in `benchmarks` the command of
-the row, which is in its [card](tables/robots-cards.json) and in the [table](tables/robots.csv); for example:
+the row, which is in its [card](tables/robots-cards.json) and in the [table](tables/robots.csv). Its threshold is 0.9
+d\\* (of the arm: in the first draw; `--seed` makes another one). For example:
 
 {commands}
 
@@ -79,7 +72,8 @@ the commands. These two were chosen after a look at the distances of one draw.
 
 **The largest deviation is a stop.** In `single_joint_wrist_roll`, the wrist stops at -1.03 rad while the command goes
 on to -1.6 rad, and the servo's load rises to 9 N m (as published). No model that was learned from other motions knows
-it: in {stopped} of {draws} draws, this motion is the worst one of the linear model. The physical model errs by a third
+it: in {stopped} of {draws} draws, this motion is the worst one of the linear model. `ctxval why` has no stop of a joint
+in its dictionary, and so names no cause. The physical model errs by a third
 of the linear one in the median motion, and no less in this one.
 
 {arm_causes}
@@ -133,11 +127,11 @@ def page() -> GeneratedPage:
     whole = REPEATS[double_pendulum.UNDISTURBED, 3.0]
     text = TEXT.format(
         rows=rows,
-        draws=len(_of_arm("linear", SHARES[0])),
+        draws=len(of_arm("linear", SHARES[0])),
         commands=_commands(cards),
         sources=_sources(),
         arm=_arm(),
-        stopped=_worst("linear").count("single_joint_wrist_roll"),
+        stopped=worst_motions("linear").count("single_joint_wrist_roll"),
         arm_causes=_arm_causes(),
         torque_error=whole["torque_error"],
         torque=whole["torque"],
@@ -161,142 +155,6 @@ def _whole(cards: Sequence[Card]) -> Table:
     return head, [[cell.replace("\\", "") for cell in each.row()] + [each.command] for each in cards]
 
 
-# Cards
-
-
-def all_cards() -> Iterable[Card]:
-    """Return the cards of all rows."""
-    for kind in KINDS:
-        yield _card_of_arm(kind)
-    for seconds in SECONDS:
-        for model in (*double_pendulum.PUBLISHED, *double_pendulum.LEARNED):
-            if ("double pendulum", model, f"{seconds} s", SHARES[0]) in CAMPAIGNS:
-                yield _card_of_pendulum(model, seconds)
-    for model in ("m1", "m3", "m4"):
-        yield _card_of_servo(model)
-
-
-def _of_arm(kind: str, share: float) -> list[dict[str, Any]]:
-    return CAMPAIGNS.select(robot="SO-101", model=kind, share=share)
-
-
-def _worst(kind: str) -> list[str]:
-    return [line["tasks"][int(np.argmax(line["distances"]))] for line in _of_arm(kind, 1.1)]
-
-
-def spread(values: Sequence[float], digits: int = 3) -> str:
-    """Return the median with the smallest and the largest of values, if these differ."""
-    median, low, high = (f"{each:.{digits}g}" for each in (np.median(values), min(values), max(values)))
-    return median if low == high else f"{median} ({low} to {high})"
-
-
-def _answers(lines: Sequence[dict[str, Any]]) -> str:
-    answers = [line["answer"] for line in lines]
-    each = [f"{answers.count(answer)} {answer}" for answer in dict.fromkeys(answers)]
-    return answers[0] if len(answers) == 1 else ", ".join(each)
-
-
-def _verdicts(of_share: dict[float, list[dict[str, Any]]], largest: float) -> tuple[CardVerdict, ...]:
-    verdicts = []
-    for share, lines in of_share.items():
-        counts = [len(line["tasks"]) for line in lines]
-        executions = counts[0] if len(counts) == 1 else f"{spread(counts)} executions"
-        verdicts.append(CardVerdict(share * largest, _answers(lines), executions))
-    return tuple(verdicts)
-
-
-def _card_of_arm(kind: str) -> Card:
-    lines = {share: _of_arm(kind, share) for share in SHARES}
-    largest = float(np.median([line["largest"] for line in lines[1.1]]))
-    worst = _worst(kind)
-    told = CAUSES.get(("SO-101", "linear", "wrist roll")) if kind == "linear" else None
-    return Card(
-        "SO-101 arm",
-        f"{kind}, learned from five motions",
-        f"model: ctxval; {OF_ARM}" if kind == "linear" else f"masses: TheRobotStudio; {OF_ARM}",
-        LARGEST.format("five joints"),
-        "rad",
-        largest,
-        largest,
-        _verdicts(lines, largest),
-        spread([len(line["tasks"]) for line in lines[1.1]]),
-        max(set(worst), key=worst.count),
-        _cause(told),
-        _repair(told),
-        f"ctxval run robots.so101:experiment --option folder=FOLDER --option model={kind} --threshold 0.5",
-    )
-
-
-def _card_of_pendulum(model: str, seconds: float) -> Card:
-    lines = {share: [CAMPAIGNS["double pendulum", model, f"{seconds} s", share]] for share in SHARES}
-    (line,) = lines[1.1]
-    told = CAUSES.get(("double pendulum", model, f"{seconds} s"))
-    published = model in double_pendulum.PUBLISHED
-    return Card(
-        "pendubot, TVLQR",
-        f"model {model}" if published else f"{model}, learned from five perturbed runs",
-        "model and " + OF_PENDULUM if published else f"model: ctxval; {OF_PENDULUM}",
-        LARGEST.format(f"both angles up to {seconds:g} s"),
-        "rad",
-        line["largest"],
-        line["largest"],
-        _verdicts(lines, line["largest"]),
-        len(line["tasks"]),
-        line["tasks"][int(np.argmax(line["distances"]))],
-        _cause(told),
-        _repair(told),
-        f"ctxval run robots.double_pendulum:experiment --option folder=FOLDER --option model={model} "
-        f"--option seconds={seconds} --threshold 0.2",
-    )
-
-
-def _card_of_servo(model: str) -> Card:
-    lines = {share: SERVO.select(model=model, share=share) for share in SHARES}
-    largest = max(max(line["distances"]) for line in lines[1.1])
-    worst = max(lines[1.1], key=lambda line: max(line["distances"]))
-    told = SERVO_CAUSES.get((1, 0)) if model == "m1" else None
-    refined = [line for line in SERVO_REFINED.select(model=model) if line["after"]]
-    repaired = [(max(line["before"].values()), max(line["after"].values())) for line in refined]
-    return Card(
-        "XL330 servo, pendulum",
-        f"friction model {model}",
-        OF_SERVO,
-        LARGEST.format("the angle over 6 s"),
-        "rad",
-        largest,
-        largest,
-        _verdicts(lines, largest),
-        spread([len(line["tasks"]) for line in lines[1.1]]),
-        worst["tasks"][int(np.argmax(worst["distances"]))],
-        _cause(told),
-        "; ".join(f"refined with 8 runs: {before:.2f} to {after:.2f} rad on 8 others" for before, after in repaired)
-        or (
-            "no model: a run that it learned from stays above the threshold"
-            if SERVO_REFINED.select(model=model)
-            else ""
-        ),
-        "env -C ../examples/servo ctxval run servo:experiment --option folder=FOLDER "
-        f"--option friction={model} --threshold 0.5",
-    )
-
-
-def _cause(told: dict[str, Any] | None) -> str:
-    """Return the cause that ``ctxval why`` names, or else what comes nearest."""
-    if told is None:
-        return ""
-    first, _, rest = str(told["sentence"]).partition(". ")
-    nearest = rest.partition(". ")[0]
-    return first if told["named"] or not nearest else f"none named; {nearest[0].lower()}{nearest[1:]}"
-
-
-def _repair(told: dict[str, Any] | None) -> str:
-    if told is None:
-        return ""
-    if "after" not in told:
-        return "none, because no cause is named"
-    return f"{told['before']:.3g} to {told['after']:.3g} rad on {told['of']} others, nearer in {told['nearer']}"
-
-
 # Parts of the page
 
 
@@ -313,7 +171,7 @@ def _arm() -> str:
     head = ["model", "d* [rad]", "median motion [rad]", "worst of 45 found after", "falsified at 0.9 d* after"]
     rows = []
     for kind in KINDS:
-        whole, falsified = _of_arm(kind, 1.1), _of_arm(kind, 0.9)
+        whole, falsified = of_arm(kind, 1.1), of_arm(kind, 0.9)
         found = [1 + int(np.argmax(line["distances"])) for line in whole]
         columns = [line["largest"] for line in whole], [line["median"] for line in whole], found
         rows.append([kind, *map(spread, columns), spread([len(line["tasks"]) for line in falsified])])
@@ -327,7 +185,7 @@ def _arm() -> str:
 
 
 def _arm_causes() -> str:
-    rows = [[about, _cause(line), _repair(line)] for (robot, _, about), line in CAUSES.items() if robot == "SO-101"]
+    rows = [[about, cause(line), repair(line)] for (robot, _, about), line in CAUSES.items() if robot == "SO-101"]
     if not rows:
         return "`ctxval why` did not end within ten minutes for one joint of this arm."
     intro = (

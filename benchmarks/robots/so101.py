@@ -183,4 +183,5 @@ def experiment(folder: str, seed: int = 0, model: str = "linear") -> Experiment:
     """Return the validation of a model that is learned from five motions drawn with a seed against the other 45."""
     path = Path(folder)
     others = sorted(set(recordings(path)) - set(drawn(path, seed)))
-    return Experiment(f"SO-101, {model} model", validation(path, learned(path, model, seed), others))
+    made = validation(path, learned(path, model, seed), others)
+    return Experiment(f"SO-101, {model} model", made, budget=len(others))

@@ -15,7 +15,7 @@ from shared_data import shared_data
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
-from robots import double_pendulum, page, so101
+from robots import cards, double_pendulum, page, so101
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def two_motions(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_page_and_its_cards_are_those_of_the_stored_results() -> None:
     assert page.page().outdated() == [], "run `make robots`."
-    assert json.loads(page.CARDS.read_text()) == json.loads(json.dumps([card.to_json() for card in page.all_cards()]))
+    assert json.loads(page.CARDS.read_text()) == json.loads(json.dumps([card.to_json() for card in cards.all_cards()]))
 
 
 def test_rates_of_the_arm_are_differences_of_its_angles(two_motions: Path) -> None:
