@@ -71,9 +71,26 @@ def test_the_times_of_falls_differ() -> None:
     assert distance(low, low, TASK) == 0
 
 
+def test_contacts_last_for_different_times() -> None:
+    model, system = turning(1.0, 0.0), turning(1.0, 0.0)
+    model.states[5:9, 0], model.states[:, 1] = -1.0, 1.0
+    system.states[5:7, 0], system.states[:, 1] = -1.0, 1.0
+    system.states[10:16, 1] = -1.0
+    model.states[:5, 0] = model.states[9:, 0] = system.states[:5, 0] = system.states[7:, 0] = 1.0
+    distance = distances.ContactTime(["left", 1], height=0.02).with_states(("left", *"abcdefghijkl"))
+    assert distance(model, system, TASK) == pytest.approx(6 * DT)
+    assert distances.ContactTime([0], height=0.02)(model, system, TASK) == pytest.approx(2 * DT)
+
+
 @pytest.mark.parametrize(
     "distance",
-    [distances.BodyVelocity(), distances.CommandError("mean"), distances.Orientation(), distances.FallTime(tilt=0.4)],
+    [
+        distances.BodyVelocity(),
+        distances.CommandError("mean"),
+        distances.ContactTime([7], 0.5),
+        distances.Orientation(),
+        distances.FallTime(tilt=0.4),
+    ],
 )
 def test_they_keep_the_contract(distance: distances.Distance) -> None:
     def batch(shift: float) -> Trajectory:

@@ -131,6 +131,15 @@ def test_a_known_point_is_never_proposed_even_where_it_is_the_best() -> None:
             assert np.linalg.norm(found - np.clip(top, 0, 1)) < 0.2
 
 
+def test_the_maximiser_stays_away_from_known_points_if_anything_else_is_a_candidate() -> None:
+    known = np.array([[0.4, 0.4], [0.42, 0.4]])
+    found = maximise(Hill((0.4, 0.4)), 2, known, np.random.default_rng(0), near=0.05)
+    assert 0.05 < np.abs(found - known).max(axis=1).min() < 0.1
+    crowded = np.linspace(0, 1, 21)[:, None]
+    found = maximise(Hill((0.41,)), 1, crowded, np.random.default_rng(0), near=0.05)
+    np.testing.assert_allclose(found, 0.41, atol=1e-4)
+
+
 def test_the_maximiser_is_a_function_of_its_generator() -> None:
     bound = UpperConfidenceBound(process())
     first, again = (maximise(bound, 2, bound.process.X, np.random.default_rng(4)) for _ in range(2))

@@ -148,6 +148,29 @@ def test_a_wrong_prediction_shrinks_the_box_and_misses_end_the_climb() -> None:
     assert max(note["climb"] for note in notes) >= 1
 
 
+@pytest.mark.parametrize("dimension", [1, 2, 4])
+@pytest.mark.parametrize("factor", [0.95, 1.0, 1.1])
+def test_copies_of_executed_points_are_rare(dimension: int, factor: float) -> None:
+    search = TrustRegion()
+    run(search, hill, lambda X: factor * hill(X), 20, dimension)
+    gaps = [np.abs(search.points[:k] - search.points[k]).max(axis=1).min() for k in range(1, 20)]
+    copies = np.flatnonzero(np.array(gaps) <= search.settings.near) + 1
+    gained = search.values[copies] > np.maximum.accumulate(search.values)[copies - 1]
+    assert len(copies) <= 1 or gained.all()
+
+
+@pytest.mark.parametrize(("moved", "is_executed"), [(1e-2, True), (5e-5, False)])
+def test_a_copy_is_executed_if_it_is_predicted_to_be_larger(moved: float, is_executed: bool) -> None:
+    def ramp(X: Array) -> Array:
+        return X.sum(axis=1)
+
+    search, known = TrustRegion(), np.full((1, 4), 1 - moved)
+    search.reset(4, 0)
+    search.tell(known, ramp(known))
+    search.use_prediction(predicting(ramp))
+    assert bool(np.abs(search.ask(1) - known).max() <= search.settings.near) is is_executed
+
+
 def test_no_point_is_asked_twice_and_what_failed_is_kept_away_from() -> None:
     def holed(X: Array) -> Array:
         return np.where(np.linalg.norm(X - [0.3, 0.8], axis=1) < 0.1, np.nan, hill(X))

@@ -17,7 +17,7 @@ from ctxval.distances.deviations import (
     TrackingError,
     WholeTrajectory,
 )
-from ctxval.distances.motion import BodyVelocity, CommandError, FallTime, Orientation
+from ctxval.distances.motion import BodyVelocity, CommandError, ContactTime, FallTime, Orientation
 from ctxval.distances.unsafe_margin import UnsafeMargin
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "BodyVelocity",
     "CommandError",
     "ComposedDistance",
+    "ContactTime",
     "CrossingTime",
     "Distance",
     "FallTime",

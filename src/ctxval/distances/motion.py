@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.checked import NonNegativeFloat, NonNegativeInt
+from ctxval._util.checked import FiniteFloat, NonNegativeFloat, NonNegativeInt
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
+from ctxval.core.distance import NamedStates, selected
 from ctxval.core.floating_base import Fall, FloatingBase
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -105,6 +107,25 @@ class FallTime(ShortRepr):
             np.minimum(fall.steps(run), task.horizon) for run in (system_trajectory, model_trajectory)
         )
         return np.asarray(np.abs(of_system - of_model) * task.dt)
+
+
+@part()
+@dataclass(frozen=True)
+class ContactTime(NamedStates):
+    """Largest difference in seconds between the times for which a foot of M and of S touches the ground, by its height.
+
+    The heights of feet are states, as those of sites of :class:`ctxval.systems.MuJoCo` with ``axes="z"``.
+    """
+
+    components: Sequence[int | str]  #: the heights of the feet, by index or by the name in the experiment
+    height: FiniteFloat  #: a foot touches the ground if it is not higher, metres
+
+    def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+        of_system, of_model = (
+            (selected(run.states[..., 1:, :], self.components) <= self.height).sum(axis=-2)
+            for run in (system_trajectory, model_trajectory)
+        )
+        return np.asarray(np.abs(of_system - of_model).max(axis=-1) * task.dt)
 
 
 def _first(after: float, task: Task) -> int:

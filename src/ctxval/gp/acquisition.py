@@ -23,6 +23,7 @@ class Acquisition(Protocol):
         """Return the values ``(m,)`` and their gradients ``(m, d)``."""
 
 
+NEAR = 1e-6  # change of each coordinate up to which two points are one
 _FAR_BELOW = -1e3  # below this number of standard deviations, a series replaces differences of large logarithms
 _CERTAIN = 1e-9  # least standard deviation in the expected improvement; smaller ones are replaced by it
 _LOG_ROOT_2PI = 0.5 * float(np.log(2 * np.pi))
@@ -107,12 +108,14 @@ def maximise(
     box: Box | None = None,
     corners: bool = False,
     away: Array | None = None,
+    near: float = NEAR,
 ) -> Array:
     """Return the point ``(d,)`` of a box, or the unit cube, with the largest acquisition, distinct from known points.
 
-    Candidates are uniform, or small moves of the known points ``(n, d)``, best first. The function is climbed from the
-    best few of them. With corners, these are candidates too, and single coordinates are moved to bounds at last while
-    that increases the value. The result keeps a distance from points ``away``, which are pending or have failed.
+    A coordinate of it differs from each known point by more than ``near``, if it does for any candidate. Candidates are
+    uniform, or small moves of the known points ``(n, d)``, best first. The function is climbed from the best few of
+    them. With corners, these are candidates too, and single coordinates are moved to bounds at last while that
+    increases the value. The result keeps a distance from points ``away``, which are pending or have failed.
     """
     diagonal = float(np.sqrt(dimension))
     others = np.empty((0, dimension)) if away is None else away
@@ -140,9 +143,10 @@ def maximise(
         row = [int(heights.argmax())]
         top, _ = polish(lambda Z: acquisition(Z[0])[None], climbed[row], heights[row], (low, high), 2 * dimension)
         climbed = np.concatenate([climbed, top])
-    finalists = np.concatenate([climbed, candidates[order[:16]]])
-    is_new = scipy.spatial.distance.cdist(finalists, known, "chebyshev").min(axis=1, initial=np.inf) > 1e-6
-    values = np.where(is_new & is_apart(finalists), acquisition(finalists), -np.inf)
-    if not np.isfinite(values).any():
-        return np.asarray(low + rng.random(dimension) * (high - low))
-    return np.asarray(finalists[np.argmax(values)])
+    finalists = np.concatenate([climbed, best])
+    gaps = scipy.spatial.distance.cdist(finalists, known, "chebyshev").min(axis=1, initial=np.inf)
+    for least in (near, NEAR):
+        values = np.where((gaps > least) & is_apart(finalists), acquisition(finalists), -np.inf)
+        if np.isfinite(values).any():
+            return np.asarray(finalists[np.argmax(values)])
+    return np.asarray(low + rng.random(dimension) * (high - low))

@@ -19,7 +19,7 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.registry import part
-from ctxval.gp.acquisition import Acquisition, LogExpectedImprovement, UpperConfidenceBound, maximise
+from ctxval.gp.acquisition import NEAR, Acquisition, LogExpectedImprovement, UpperConfidenceBound, maximise
 from ctxval.gp.surrogate import SurrogateHyperparameters, kept_rows, learn
 from ctxval.searches.base import Note, SequentialSearch, best_first
 
@@ -70,8 +70,11 @@ class BayesianOptimisation(SequentialSearch):
         point, self._last_note = self.choose(self.points, self.values, rng)
         return point
 
-    def choose(self, points: Array, values: Array, rng: np.random.Generator) -> tuple[Array, Note]:
-        """Return the next point ``(d,)`` after a history, which any search may have made, and a note on the choice."""
+    def choose(self, points: Array, values: Array, rng: np.random.Generator, near: float = NEAR) -> tuple[Array, Note]:
+        """Return the next point ``(d,)`` after a history, which any search may have made, and a note on the choice.
+
+        A coordinate of it differs from each known point by more than ``near``, if it does for any candidate.
+        """
         few = self.dimension <= 2
         if len(values) < self.initial or np.isfinite(values).sum() < 2:
             point = _filling(points, rng) if few and len(points) else rng.random(self.dimension)
@@ -79,9 +82,9 @@ class BayesianOptimisation(SequentialSearch):
         if few and len(values) % self.settings.everywhere == 0:
             return _filling(points, rng), {"engine": _ENGINE, "how": "filling"}
         with single_threaded():
-            return self._most_worth(points, values, rng)
+            return self._most_worth(points, values, rng, near)
 
-    def _most_worth(self, points: Array, values: Array, rng: np.random.Generator) -> tuple[Array, Note]:
+    def _most_worth(self, points: Array, values: Array, rng: np.random.Generator, near: float) -> tuple[Array, Note]:
         known = np.isfinite(values)
         learned = self._learned(points[known], values[known])
         rows = kept_rows(points, values, 1000)
@@ -109,7 +112,7 @@ class BayesianOptimisation(SequentialSearch):
         if branch is not None:
             box[0 if branch.upper else 1][branch.coordinate] = 0.5
         known_first, away = best_first(points, values), points[~known]
-        point = maximise(acquisition, self.dimension, known_first, rng, box=box, corners=True, away=away)
+        point = maximise(acquisition, self.dimension, known_first, rng, box=box, corners=True, away=away, near=near)
         return point, {
             "engine": _ENGINE,
             "how": "bound" if isinstance(acquisition, UpperConfidenceBound) else "improvement",

@@ -25,6 +25,7 @@ from ctxval._util.arrays import Array, Mask, single_threaded
 from ctxval._util.checked import NonNegativeFloat, PositiveInt, Seconds
 from ctxval._util.progress import expect
 from ctxval._util.registry import part
+from ctxval.gp.acquisition import NEAR
 from ctxval.gp.ascent import ascend, usual_effort
 from ctxval.gp.surrogate import fit_surrogate, kept_rows
 from ctxval.searches.base import Costs, Note, Prediction, SequentialSearch, best_first
@@ -44,6 +45,8 @@ class TrustRegionSettings:
     improvement: float = 1e-3  # least predicted improvement worth an execution, as a share of the largest value
     compared_from: int = 6  # number of known values from which on the prediction must be better than the surrogate
     compared_on: int = 24  # largest number of known values, the latest ones, on which the two are compared
+    near: float = 0.02  # change of each coordinate to a known point up to which a point is its copy
+    refined: float = 1e-4  # least predicted improvement worth a copy, as a share of the largest value
 
 
 class _Candidate(NamedTuple):
@@ -107,7 +110,7 @@ class TrustRegion(SequentialSearch):
 
     def propose(self, rng: np.random.Generator) -> Array:
         """Return the next point: by the first good prediction or, if there is none, by Bayesian optimisation."""
-        prediction, why = self._prediction, "there is no prediction"
+        prediction, why, candidate = self._prediction, "there is no prediction", None
         surrogate_error = functools.cache(self._surrogate_error)  # all predictions are compared with the same one
         while prediction is not None:
             with single_threaded():
@@ -123,7 +126,9 @@ class TrustRegion(SequentialSearch):
                 break
             why = doubtful or "nothing is predicted anywhere"
             prediction = None if prediction.otherwise is None else prediction.otherwise()
-        point, note = self._fallback.choose(self.points, self.values, rng)
+        # A hedge looks elsewhere; without a prediction, Bayesian optimisation refines maxima, too.
+        near = NEAR if candidate is None else self.settings.near
+        point, note = self._fallback.choose(self.points, self.values, rng, near)
         self._last_note = {**note, "why": why}
         return point
 
@@ -231,6 +236,11 @@ class TrustRegion(SequentialSearch):
             starts = best_first(history.points, history.values)[:8]
             points, predicted = ascend(value, box, budget, starts, rng, rough)
         points = points[self._is_new(points, history) & np.isfinite(predicted)]
+        if len(points) and few is None:
+            apart = _gaps(points, history) > self.settings.near
+            if not apart[0]:  # it is worth an execution only if it is predicted to exceed the largest known value
+                here, there = prediction.expected(np.stack([points[0], starts[0]]))[0]
+                points = points if here > (1 + self.settings.refined) * there else points[apart]
         if not len(points):
             return None
         point = next(filter(prediction.steady or (lambda point: True), points), points[0])
@@ -238,10 +248,8 @@ class TrustRegion(SequentialSearch):
         return _Candidate(point, float(expected[0]), float(doubt[0]))
 
     def _is_new(self, points: Array, history: _History) -> Mask:
-        known, reach = np.isfinite(history.values), 0.05 * np.sqrt(self.dimension)
-        gaps = scipy.spatial.distance.cdist(points, history.points[known], "chebyshev").min(axis=1, initial=np.inf)
         others = scipy.spatial.distance.cdist(points, history.others).min(axis=1, initial=np.inf)
-        return np.asarray((gaps > 1e-6) & (others > reach))
+        return np.asarray((_gaps(points, history) > NEAR) & (others > 0.05 * np.sqrt(self.dimension)))
 
     def _state(self, history: _History) -> _Region:
         region, largest = _Region(), -np.inf
@@ -266,6 +274,12 @@ class TrustRegion(SequentialSearch):
                 region = replace(region, stale=0)
             largest = max(largest, value) if np.isfinite(value) else largest
         return region
+
+
+def _gaps(points: Array, history: _History) -> Array:
+    """Return the largest difference of a coordinate from the nearest point with a known value, ``(m,)``."""
+    known = history.points[np.isfinite(history.values)]
+    return np.asarray(scipy.spatial.distance.cdist(points, known, "chebyshev").min(axis=1, initial=np.inf))
 
 
 def _log_error(expected: Array, values: Array) -> float:
