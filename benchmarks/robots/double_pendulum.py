@@ -23,6 +23,17 @@ from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.errors import InputError
 
 UNDISTURBED, PERTURBED = "pendubot-ilqr_tvlqr_lqr", "pendubot-perturbed-ilqr_tvlqr_lqr"
+CONDITIONS = {
+    UNDISTURBED: "pendubot, TVLQR",
+    PERTURBED: "pendubot, TVLQR, random torque pulses",
+    "pendubot-mcpilco": "pendubot, MC-PILCO",
+    "pendubot-sac_lqr": "pendubot, SAC",
+    "acrobot-ilqr_tvlqr_lqr": "acrobot, TVLQR",
+    "acrobot-perturbed-ilqr_tvlqr_lqr": "acrobot, TVLQR, random torque pulses",
+    "acrobot-mcpilco": "acrobot, MC-PILCO",
+}
+"""The recorded conditions, by the names of their files."""
+
 DT = 0.0025  # s, the mean period of the recordings
 REFERENCE_DT = 0.001  # s, by which the recorded reference angles are the integral of the recorded reference rates
 GRAVITY, GEAR = 9.81, 6.0

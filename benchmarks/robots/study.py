@@ -89,20 +89,19 @@ def decided(validation: Validation, share: float, seed: int, thinking: float | N
 
 
 def repeated(folder: Path, condition: str, seconds: float) -> dict[str, Any]:
-    """Return the largest difference between two repeats of a condition, and how far the controller's torque is away."""
+    """Return the largest difference between two repeats of a condition; under TVLQR, also errors of its torque."""
     repeats = list(double_pendulum.runs(folder, condition, seconds).values())
     angles = np.stack([run.states[:, :2] for run in repeats])
+    found = {"count": len(repeats), "largest": float(np.ptp(angles, axis=0).max())}
+    if condition != double_pendulum.UNDISTURBED:
+        return found
     controller, torques = double_pendulum.controller(folder), list[Array]()
     for run in repeats:
         pi = started(controller, Task(run.states[0], horizon=run.horizon, dt=double_pendulum.DT))
         torques.append(np.stack([pi(t, run.states[t])[0] for t in range(run.horizon)]))
     recorded = np.stack([run.inputs[:, 0] for run in repeats])
-    return {
-        "count": len(repeats),
-        "largest": float(np.ptp(angles, axis=0).max()),
-        "torque_error": float(np.abs(np.stack(torques) - recorded).mean()),
-        "torque": float(np.sqrt((recorded**2).mean())),
-    }
+    error, size = np.abs(np.stack(torques) - recorded).mean(), np.sqrt((recorded**2).mean())
+    return {**found, "torque_error": float(error), "torque": float(size)}
 
 
 def cause_of_joint(folder: Path, seed: int, joint: int) -> dict[str, Any]:
@@ -174,7 +173,7 @@ def store(stored: JsonLines, key: Key, computed: Callable[[], dict[str, Any]]) -
 def main() -> None:
     """Compute what is missing."""
     if (folder := require_recordings("double_pendulum")) is not None:
-        for condition in (double_pendulum.UNDISTURBED, double_pendulum.PERTURBED):
+        for condition in double_pendulum.CONDITIONS:
             for seconds in SECONDS:
                 store(REPEATS, (condition, seconds), lambda c=condition, s=seconds: repeated(folder, c, s))
         for seconds in SECONDS:
