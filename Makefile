@@ -11,7 +11,7 @@ export OMP_NUM_THREADS = 1
 unexport PYTHONDONTWRITEBYTECODE
 PIP := -m pip install --quiet --disable-pip-version-check --no-compile
 
-.PHONY: demo test suite quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine frozen reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo watch envelope friction safety causes clean
+.PHONY: demo test suite quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine frozen reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo robots watch envelope friction safety causes clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -107,6 +107,9 @@ compare-study: .venv/.test  ## how many executions comparisons need; writes docs
 servo: .venv/.test  ## campaigns on the recordings of a real servo; writes docs/servo.md, and resumes
 	$(BIN)/python benchmarks/study_servo.py
 	$(BIN)/python benchmarks/servo_page.py
+
+robots: .venv/.test  ## verdicts on models of real robots; writes docs/robots.md and its cards, and resumes
+	cd benchmarks && ../$(BIN)/python -m robots.study && ../$(BIN)/python -m robots.page
 
 safety: .venv/.test  ## which environments are safe: certified beside true ones? Writes docs/how-to/safety.md, and resumes
 	$(BIN)/python benchmarks/study_safety.py

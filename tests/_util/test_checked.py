@@ -124,7 +124,6 @@ CAMPAIGN = ctxval.Campaign(VALIDATION)
         (certificates.tail, {"n": 3, "discarded": 0, "volume": 0.1}),
         (certificates.volume_bound, {"n": 3, "discarded": 0, "beta": 0.1}),
         (certificates.samples_needed, {"volume": 0.1, "beta": 0.1}),
-        (certificates.rate, {"n": 3, "dimension": 1}),
     ],
     ids=lambda value: getattr(value, "__qualname__", ""),
 )

@@ -150,7 +150,6 @@ def test_an_undecided_verdict_names_the_task_that_is_executed_next() -> None:
     assert verdict.answer == "undecided"
     assert verdict.next_task is not None
     assert verdict.expected is not None
-    assert verdict.expected.fewest
     assert str(verdict.expected) in verdict.reason
     assert "next task: x_init[0] " in verdict.reason
     assert campaign.store.digest() == stored

@@ -3,13 +3,28 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ctxval import Task, Trajectory, systems
+from ctxval import (
+    Campaign,
+    Experiment,
+    Task,
+    TaskSuite,
+    Trajectory,
+    Validation,
+    controllers,
+    distances,
+    load_experiment,
+    models,
+    systems,
+)
+from ctxval.cli.config.check import check_experiment
+from ctxval.core.trajectory import COMPLETE
 from ctxval.data import LogMapping
-from ctxval.data.recordings import RecordedInputsWarning
+from ctxval.data.recorded_system import RecordedInputsWarning
 from ctxval.errors import ExecutionError, InputError
 from facts import refuses, warns
 
@@ -86,3 +101,70 @@ def test_a_log_with_a_gap_is_no_execution(tmp_path: Path) -> None:
     (tmp_path / "lift.json").write_text(json.dumps(rows))
     with refuses(InputError, "lift.json", 2):
         systems.Recorded(tmp_path, MAPPING)
+
+
+def test_a_recording_that_a_safety_limit_ended_is_an_outcome() -> None:
+    stopped = systems.Recorded({"lift": RUN}, stopped_by="a safety limit").execute(constant, task("lift", 8))
+    assert stopped.is_outcome
+    assert stopped.horizon == 5
+    whole = systems.Recorded({"lift": RUN}, stopped_by="a safety limit").execute(constant, task("lift", 4))
+    assert whole.ended == COMPLETE
+    fallen = systems.Recorded({"lift": replace(RUN, ended="terminated: it fell")}).execute(constant, task("lift", 8))
+    assert fallen.ended == "terminated: it fell"
+
+
+def test_a_model_that_goes_on_is_falsified_by_a_recording_that_was_stopped() -> None:
+    names = ("lift", "turn")
+    validation = Validation(
+        space=TaskSuite(names),
+        task=lambda p: task("", 5),
+        system=systems.Recorded({"lift": RUN, "turn": RUN.first(3)}, stopped_by="a safety limit"),
+        model=models.Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]]),
+        synthesizer=controllers.Policy(lambda t, x, task: np.ones(1)),
+        distance=distances.MaximumDeviation(),
+        start_tolerance=1.0,
+    )
+    campaign = Campaign(validation).run(2, 100.0)
+    assert campaign.verdict(100.0).answer == "falsified"
+    assert {trial.parameters["task"]: trial.state for trial in campaign.trials}["turn"] == "failed"
+
+
+FILE = """
+task = "recorded"
+synthesizer = "recorded"
+model = { type = "Linear", A = [[1.0, 0.1], [0.0, 1.0]], B = [[0.0], [0.1]] }
+distance = { type = "MaximumDeviation" }
+
+[system]
+type = "Recorded"
+runs = "."
+mapping = { states = { x = "x", v = "v" }, inputs = { u = "u" } }
+"""
+
+
+def test_a_file_takes_tasks_and_inputs_from_recordings(tmp_path: Path) -> None:
+    folder_with(tmp_path, "lift", "turn")
+    rows = [{"t": t, "x": 3 * t, "v": 3.0, "u": -1.0} for t in 0.1 * np.arange(4)]
+    (tmp_path / "turn.json").write_text(json.dumps(rows))
+    (tmp_path / "arm.toml").write_text(FILE)
+    validation = load_experiment(tmp_path / "arm.toml").validation
+    assert isinstance(validation.space, TaskSuite)
+    assert validation.space.task_names == ("lift", "turn")
+    plan = validation.plan(validation.space.point({"task": "turn"}))
+    assert plan.task.horizon == 3
+    assert np.allclose(plan.model_trajectory.states[0], [0.0, 3.0])
+    assert np.allclose(plan.model_trajectory.inputs, -1.0)
+    campaign = Campaign(validation).run(2, 10.0)
+    assert campaign.verdict(10.0).answer == "validated"
+    findings = check_experiment(Experiment("arm", validation))  # of tasks with different horizons
+    assert not [each for each in findings if each.state == "failed"]
+    with_space = FILE.replace('"Recorded"', '"Simulated"')
+    (tmp_path / "arm.toml").write_text(with_space.replace('runs = "."', "").replace("mapping", "step"))
+    with refuses(InputError):
+        load_experiment(tmp_path / "arm.toml")
+
+
+def test_recorded_inputs_take_batches_of_draws() -> None:
+    recorded = systems.Recorded({"lift": RUN})
+    controller = recorded.design(task("lift"), models.Linear([[1.0]], [[1.0]]))
+    assert controller(2, np.zeros((4, 3, 2))).shape == (4, 3, 1)

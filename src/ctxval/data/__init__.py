@@ -3,7 +3,8 @@
 from ctxval.data.log import Clock, Log, MemoryTable, Message, Signal, Table, TopicLog
 from ctxval.data.mapping import Field, LogMapping, Observer
 from ctxval.data.readers import READERS, component_names, is_log, read_logs
-from ctxval.data.recordings import Recorded, Recording, Recordings, read_recordings, recordings_of
+from ctxval.data.recorded_system import Recorded
+from ctxval.data.recordings import Recording, Recordings, read_recordings, recordings_of
 from ctxval.data.sampling import Break, Channel
 
 __all__ = [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,19 +12,15 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.columns import FAR, conversion, sentinels, time_column, unit_advice
 from ctxval._util.refusals import reworded
-from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr, call, counted
+from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.texts import enumerated
-from ctxval.core.controller import Controller
-from ctxval.core.plan import input_difference, inputs_along
-from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.log import Clock, Log, Signal, Table
 from ctxval.data.mapping import LogMapping, Observer
 from ctxval.data.rates import Clocked, Column, require_scale
-from ctxval.data.readers import component_names, logs_in, read_logs
+from ctxval.data.readers import component_names, read_logs
 from ctxval.data.sampling import Break, Channel, sampled
-from ctxval.errors import ExecutionError, InputError
+from ctxval.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,69 +321,3 @@ def _from_step(first: int, run: Recording, states: Array, dt: float) -> Recordin
 
 def _too_short(run: Recording, what: str, dt: float) -> Break:
     return Break(run.source, run.start, run.trajectory.horizon * dt, "a part", f"is too short for {what}")
-
-
-class RecordedInputsWarning(UserWarning):
-    """Recorded inputs are not those of the controller of their task."""
-
-
-@part(files=("runs",))
-class Recorded:
-    """Recorded executions of named tasks, such as those of a :class:`ctxval.TaskSuite`, as the true system.
-
-    The execution of a task is the recording with its name; the controller is not asked. So a campaign sees what it
-    would have seen on the system, one execution at a time, and can be judged afterwards by what it did not see. The
-    recordings must be made with the controllers of the campaign, which holds for controllers that do not depend on M.
-
-    Args:
-        runs: the recordings by the names of their tasks, or a folder with one log for each task, whose name is that of
-            the file without its ending.
-        mapping: which fields of the logs are states and inputs, and how long a step is; a table as in a file, or
-            :class:`ctxval.data.LogMapping`. Without inputs, they are those that the controller gives along the records.
-    """
-
-    def __init__(
-        self, runs: Mapping[str, Trajectory] | str | Path, mapping: LogMapping | dict[str, Any] | None = None
-    ) -> None:
-        if isinstance(runs, Mapping):
-            self.runs = dict(runs)
-        else:
-            chosen = LogMapping.from_table(mapping) if isinstance(mapping, dict) else mapping
-            self.runs = {}
-            for path in logs_in(Path(runs)):
-                whole = read_recordings([path], chosen).runs
-                if len(whole) != 1:
-                    raise InputError(f"{path} must have one recording without gaps, and has {len(whole)}.")
-                name = path.stem if path.suffix.lower() != ".gz" else Path(path.stem).stem
-                self.runs[name] = whole[0].trajectory
-        if not self.runs:
-            raise InputError("there is no recording.")
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(self.runs)
-
-    def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Return the recording of a task; raise an ExecutionError if there is none."""
-        if task.name not in self.runs:
-            known = enumerated(self.runs, 6)
-            raise ExecutionError(f"there is no recording of the task {task.name!r}; there are those of {known}")
-        run, steps = self.runs[task.name], task.horizon
-        if run.horizon < steps:
-            raise ExecutionError(f"the recording of {task.name!r} has {run.horizon} steps, and the task has {steps}")
-        times, states, inputs = run.times[: steps + 1], run.states[: steps + 1], run.inputs[:steps]
-        if not inputs.shape[-1]:
-            return Trajectory(times, states, np.stack(list(inputs_along(controller, task, states[:-1]))))
-        recorded = Trajectory(times, states, inputs)
-        names = {f"u{i}": "" for i in range(inputs.shape[-1])}
-        if difference := input_difference(controller, task, recorded, names):
-            warnings.warn(
-                f"the inputs of the recording of {task.name!r} are not those of the controller at the recorded states "
-                f"({difference}): check that it was recorded with this controller, and that both begin at once.",
-                RecordedInputsWarning,
-                stacklevel=2,
-            )
-        return recorded
-
-    def __repr__(self) -> str:
-        return call(self, tasks=len(self.runs))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ctxval._util.registry import Registry
 from ctxval.core.system import Simulated, System, WithOutputs
-from ctxval.data.recordings import Recorded
+from ctxval.data.recorded_system import Recorded
 from ctxval.systems.fmu import FMU
 from ctxval.systems.functions import Function, Imperfect, Manual, rk4
 from ctxval.systems.gymnasium import Gymnasium

@@ -230,13 +230,15 @@ def _batches(validation: Validation, plans: Sequence[Plan]) -> Findings:
 
 
 def _distance(experiment: Experiment, plans: Sequence[Plan]) -> Findings:
-    validation, trajectories = experiment.validation, [plan.model_trajectory for plan in plans]
+    validation = experiment.validation
+    alike = [plan for plan in plans if plan.task.horizon == plans[0].task.horizon]  # others are no part of a batch
+    trajectories = [plan.model_trajectory for plan in alike]
     if (doubt := experiment.doubt_of_units) is not None:
         yield "noted", doubt.removesuffix(".")
     states, inputs = (np.stack([getattr(run, name) for run in trajectories]) for name in ("states", "inputs"))
     model, shifted = (Trajectory(trajectories[0].times, states + shift, inputs) for shift in (0.0, 0.01))
     try:
-        check_distance(validation.distance, model, shifted, Task.stacked([plan.task for plan in plans]))
+        check_distance(validation.distance, model, shifted, Task.stacked([plan.task for plan in alike]))
         yield "ok", "finite, not negative, and the same in a batch as alone"
     except Exception:
         for plan in plans:

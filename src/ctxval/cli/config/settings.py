@@ -27,6 +27,7 @@ from ctxval.cli.config.trust import allow
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.quantiles import QUANTILE
 from ctxval.data import LogMapping
+from ctxval.data.recorded_system import Recorded
 from ctxval.distances import UnsafeMargin
 from ctxval.errors import CertificateError, InputError, UnknownNameError
 from ctxval.models import Refined, read_refined
@@ -107,6 +108,7 @@ class SpecTable(BaseModel, extra="allow"):
         return judged_by(experiment, UnsafeMargin({"type": self.type, **(self.model_extra or {})}, margin=self.margin))
 
 
+RECORDED = "recorded"  #: the task function or the synthesizer of a file whose recorded system gives its tasks or inputs
 _WHOLE = ("space", "task", "system", "model", "synthesizer")
 
 
@@ -187,26 +189,34 @@ class ExperimentSettings(BaseModel, extra="forbid"):
     def _described(self) -> Experiment:
         if self.space is not None and self.suite is not None:
             raise InputError("the file has both [space] and [suite]: tasks fill a box, or they are a list.")
-        needed = _WHOLE if self.suite is None else _WHOLE[1:]
+        needed = _WHOLE if self.suite is None and self.task != RECORDED else _WHOLE[1:]
         if missing := ", ".join(name for name in needed if getattr(self, name) is None):
             how = "name an experiment, as in experiment = 'pendulum', or describe one"
             raise InputError(f"the file must {how}: it has no {missing}.")
         if self.options:
             named = "a named experiment (experiment = ...)"
             raise InputError(f"[options] is only for {named}; this file describes its own.")
+        system: Any = part("system", self.system or {}, self.folder)
+        if RECORDED in (self.task, self.synthesizer) and not isinstance(system, Recorded):
+            raise InputError(f"tasks and inputs that are {RECORDED!r} need a system of the type Recorded.")
         box = {name: tuple(bounds) for name, bounds in (self.space or {}).items()}
-        space = TaskSpace(**box) if self.suite is None else TaskSuite(self.suite)
-        system = part("system", self.system or {}, self.folder)
+        tasks: Any = system.names if self.suite is None and self.space is None else self.suite
+        space = TaskSpace(**box) if tasks is None else TaskSuite(tasks)
         outputs: Any = self.outputs
         if isinstance(self.outputs, str):
             outputs = require_function("outputs", reference(self.outputs, self.folder), "x -> y")
         default: Part = "FinalState"
         if self.spec is not None:  # d_a, of the states that the specification looks at
             default = {"type": "MaximumDeviation", "components": (self.spec.model_extra or {}).get("components")}
-        task = parts.task_function(self.task or {}, space, system, self.folder)
+        task = (
+            system.task if self.task == RECORDED else parts.task_function(self.task or {}, space, system, self.folder)
+        )
         tables = {"model": self.model, "synthesizer": self.synthesizer, "distance": self.distance or default}
         names = {"states": self.states, "inputs": self.inputs}
-        made = {kind: part(kind, table or {}, self.folder, names) for kind, table in tables.items()}
+        made = {
+            kind: system if table == RECORDED else part(kind, table or {}, self.folder, names)
+            for kind, table in tables.items()
+        }
         labels = Labels(labels_of(self.states), labels_of(self.inputs), self.units or "")
         validation = Validation(space=space, task=task, system=system, labels=labels, outputs=outputs, **made)
         if isinstance(task, parts.TaskTable):

@@ -1,0 +1,1 @@
+"""Models on real robots, against recordings that others have published and this repository does not hold."""
