@@ -27,7 +27,7 @@ from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import NoiseSettings, NoiseStudy
-from ctxval.learning.parametric import ParametricDynamics, ParametricSettings, learned_parameters
+from ctxval.learning.parametric_dynamics import ParametricDynamics, ParametricSettings, learned_parameters
 from ctxval.learning.precision import AgreeingDynamics, AgreementSettings, agreeing_posterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, schedule, scheduled

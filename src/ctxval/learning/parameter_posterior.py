@@ -137,7 +137,7 @@ def parameter_posterior(
     def squares(z: Array) -> Array:
         """Return the mean squared errors ``(S, N)`` of segments; 1e6 where a run of the model fails."""
         errors = segments.errors(model.drawn(z), len(z))
-        return np.nan_to_num((errors**2).mean(axis=(2, 3)), nan=1e6, posinf=1e6).clip(max=1e6)
+        return np.asarray(np.nan_to_num((errors**2).mean(axis=(2, 3)), nan=1e6, posinf=1e6).clip(max=1e6))
 
     def surprise(of_segments: Array, z: Array, variance: float) -> Array:
         """Return minus the log posterior ``(S,)`` of parameters ``(S, K)``."""
@@ -192,7 +192,7 @@ def parameter_posterior(
         spread = samples - mean
         covariance = (spread * weights[:, None]).T @ spread + 0.1 * covariance
     left = float(np.minimum(squares(mean[None])[0], 10.0).mean() / max(np.minimum(first[0], 10.0).mean(), 1e-300))
-    return ParameterPosterior(model, mean, covariance, samples, weights, left, settings)
+    return ParameterPosterior(model, mean, np.asarray(covariance, dtype=np.float64), samples, weights, left, settings)
 
 
 def blocks_of(lengths: Sequence[int], count: int, horizon: int, block: int, rng: np.random.Generator) -> Rows:

@@ -48,19 +48,19 @@ class MuJoCoParameter:
     """An uncertain parameter of a model of MuJoCo, with the places of the compiled model that it changes."""
 
     prior: UncertainParameter  #: of the factor of all places, with the value 1, or of what is added to them, with 0
-    places: tuple[tuple[str, tuple[Rows, ...]], ...]  #: fields with the indices of the values that change
+    places: tuple[tuple[str, tuple[Any, ...]], ...]  #: fields with the indices of the values that change
 
     def change(self, fields: dict[str, Array], z: Array) -> None:
         """Change fields ``(S, ...)`` as standardised values ``(S,)`` of the parameter say."""
         values = self.prior.at(z)
         for field, at in self.places:
-            old = fields[field][:, *at]
+            old = fields[field][(slice(None), *at)]
             of_draws = values.reshape(-1, *[1] * (old.ndim - 1))
             if self.prior.relative:
-                fields[field][:, *at] = old * of_draws
+                fields[field][(slice(None), *at)] = old * of_draws
             else:  # a friction, a stiffness and an armature are not negative
                 low = -np.inf if self.prior.name.startswith(_SIGNED) else 0.0
-                fields[field][:, *at] = np.maximum(old + of_draws, low)
+                fields[field][(slice(None), *at)] = np.maximum(old + of_draws, low)
 
 
 def uncertain_parameters(compiled: Any, given: Mapping[str, float | str]) -> tuple[MuJoCoParameter, ...]:
@@ -87,7 +87,9 @@ def _parameter(compiled: Any, name: str, deviation: float | str) -> MuJoCoParame
     places = []
     for field, components in quantity.fields:
         values = _values(compiled, field)
-        at = (rows,) if quantity.element == "joint" and field.startswith("jnt") else (_of_field(compiled, field, rows),)
+        at: tuple[Any, ...] = (
+            (rows,) if quantity.element == "joint" and field.startswith("jnt") else (_of_field(compiled, field, rows),)
+        )
         if components:
             at = at if values.ndim > 1 else ()
             at = (*(each[:, None] for each in at), np.array(components))

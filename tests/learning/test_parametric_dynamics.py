@@ -8,7 +8,7 @@ import pytest
 from ctxval import Campaign, Task, TaskSpace, Validation, distances, models, systems
 from ctxval.core.space import Parameters
 from ctxval.core.trajectory import Trajectory
-from ctxval.learning.parametric import (
+from ctxval.learning.parametric_dynamics import (
     ParametricDraws,
     ParametricDynamics,
     ParametricPosterior,

@@ -105,7 +105,7 @@ def rest_of(
     weights[:, ~predicts] = 0.0
     rests = errors - F @ weights
     deviations = np.where(predicts, rests.std(axis=0), 0.0)
-    root = np.linalg.cholesky(inverse + 1e-15 * np.eye(count))
+    root = np.asarray(np.linalg.cholesky(inverse + 1e-15 * np.eye(count)), dtype=np.float64)
     lengths = tuple(len(each) for each in steps)
     return replace(rest, weights=weights, root=root, deviations=deviations, rests=rests, lengths=lengths)
 
@@ -327,10 +327,10 @@ class _Single:
     drawn: Model
 
     def step(self, x: Array, u: Array) -> Array:
-        return np.asarray(self.drawn.step(x[None], u[None]))[0]
+        return np.asarray(np.asarray(self.drawn.step(x[None], u[None]))[0])
 
     def start(self, x: Array) -> Array:
-        return memory_in(self.drawn, x[None])[0]
+        return np.asarray(memory_in(self.drawn, x[None])[0])
 
     def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
         following, memory = advanced(self.drawn, x[None], u[None], memory[None])
