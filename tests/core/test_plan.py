@@ -130,7 +130,11 @@ def test_most_distances_name_states() -> None:
 def test_every_distance_takes_states_by_name(name: str) -> None:
     n = len(make_validation().plan([0.5]).task.initial_state)
     labels = Labels(tuple(f"state {i} [rad]" for i in range(n)))
-    required: dict[str, Any] = {"AtTimes": {"times": [0.1]}, "RelativeDeviation": {"least": [0.1]}}.get(name, {})
+    required: dict[str, Any] = {
+        "AtTimes": {"times": [0.1]},
+        "RelativeDeviation": {"least": [0.1]},
+        "ContactTime": {"height": 0.1},
+    }.get(name, {})
     cls: Any = distances.REGISTRY[name]
     for option in options_of_states(name):
         by_name, by_index = (0 if option == "state" else (0,)), ("state 0" if option == "state" else ["state 0"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
+from scipy.linalg import expm
 
 from ctxval import (
     Array,
@@ -58,7 +58,7 @@ class LinearSystem:
         """Return the exact step of dt seconds under a held input: the first n rows of ``exp([[A, B], [0, 0]] dt)``."""
         n, m = self.B.shape
         generator = np.block([[self.A, self.B], [np.zeros((m, n + m))]])
-        rows = scipy.linalg.expm(generator * dt)[:n]
+        rows = expm(generator * dt)[:n]
         return models.Linear(rows[:, :n], rows[:, n:])
 
 
