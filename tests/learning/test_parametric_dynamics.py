@@ -51,10 +51,12 @@ def _task(p: Parameters) -> Task:
     return Task(start, goal=goal, horizon=40, dt=0.05)
 
 
-def _validation(hidden: float = 0.0) -> Validation:
+def _validation(hidden: float = 0.0, wall: float = np.inf) -> Validation:
     def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         following = _mass_on_a_rail(x, u, np.array(list(TRUE.values())))
         following[..., 1] -= hidden * np.tanh(5 * x[..., 1])
+        following[..., 1] *= following[..., 0] < wall
+        following[..., 0] = np.minimum(following[..., 0], wall)
         return following
 
     return Validation(
@@ -148,10 +150,10 @@ def test_verdicts_of_a_system_in_the_family_come_after_few_executions(share: flo
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     largest = float(validation.distances(validation.space.from_unit(grid)).max())
     campaign = Campaign(validation, seed=0)
-    campaign.run(15, threshold=share * largest)
+    campaign.run(20, threshold=share * largest)
     verdict = campaign.verdict(share * largest)
     assert verdict.answer == answer
-    assert campaign.executions <= 12
+    assert campaign.executions <= 15
     learned = campaign.recorder.dynamics.learned(campaign.trials)
     if answer == "validated":
         assert isinstance(learned, ParametricDynamics)
@@ -162,3 +164,17 @@ def test_verdicts_of_a_system_in_the_family_come_after_few_executions(share: flo
         assert evidence is not None
         assert set(evidence.parameters) == set(TRUE)
         assert 0.99 * largest < evidence.bound < 1.1 * largest
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_wall_that_no_parameter_has_is_not_validated_where_few_tasks_meet_it(seed: int) -> None:
+    validation = _validation(wall=1.6)
+    goals = np.linspace(0, 1, 201)
+    grid = np.stack(np.meshgrid(goals, np.linspace(0, 1, 5)), axis=-1).reshape(-1, 2)
+    distances_there = validation.distances(validation.space.from_unit(grid))
+    free = _validation().distances(validation.space.from_unit(grid)).max()
+    threshold = float(free + 0.6 * (distances_there.max() - free))
+    assert free < threshold < distances_there.max()
+    campaign = Campaign(validation, seed=seed)
+    campaign.run(20, threshold=threshold)
+    assert campaign.verdict(threshold).answer != "validated"

@@ -128,8 +128,8 @@ def _noise_contradicted(evidence: Evidence) -> Gap:
 
 
 def _gap(gap: StateInputGap | None, evidence: Evidence) -> Gap | None:
-    # Parameters of M hold beyond the records, too.
-    if gap is None or evidence.is_parametric:
+    # Executions cannot cover many coordinates, and parameters of M hold beyond the records.
+    if gap is None or evidence.holds_beyond_records:
         return None
     coordinates, place = " and ".join(gap.coordinates), with_units(gap.place)
     return Gap(gap.size, {"coordinates": coordinates, "percent": 100 * gap.size, "place": place})
@@ -151,12 +151,16 @@ def _unsampled_parameter(evidence: Evidence) -> Gap | None:
 
 def _unsampled_corner(evidence: Evidence) -> Gap | None:
     corner = evidence.unsampled_corner
-    return None if corner is None or evidence.is_parametric else Gap(corner.gap, {"place": with_units(corner.place)})
+    return (
+        None
+        if corner is None or evidence.holds_beyond_records
+        else Gap(corner.gap, {"place": with_units(corner.place)})
+    )
 
 
 def _unvisited_region(evidence: Evidence) -> Gap | None:
     region = evidence.unvisited_region
-    if region is None or not region.tasks or evidence.is_parametric:
+    if region is None or not region.tasks or evidence.holds_beyond_records:
         return None
     return Gap(region.size, {"within": radius_of(region.within), "place": with_units(region.place)})
 

@@ -83,8 +83,13 @@ class Evidence(ShortRepr):
 
     @property
     def is_parametric(self) -> bool:
-        """Whether uncertain parameters of M are learned, which hold beyond the records, too."""
+        """Whether uncertain parameters of M are learned."""
         return bool(self.parameters)
+
+    @property
+    def holds_beyond_records(self) -> bool:
+        """Whether parameters of M take the place of coverage: with more coordinates than executions can cover."""
+        return self.is_parametric and self.coverage.pair is None
 
     @property
     def rank(self) -> int:
