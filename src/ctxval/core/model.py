@@ -78,11 +78,13 @@ def run_of(model: Model, x: Array) -> Step:
 
 def predicted_steps(model: Model, recorded: Transitions) -> Array:
     """Return the next states ``(N, n)`` that a model predicts for recorded transitions, with its memory if recorded."""
-    predicted, memory = model.step(recorded.x, recorded.u), recorded.memory
+    memory = recorded.memory
     if memory is None or not isinstance(model, ModelWithMemory):
-        return predicted
+        return model.step(recorded.x, recorded.u)
     rows = np.flatnonzero(~np.isnan(memory).any(axis=1))
-    predicted = np.array(predicted)
+    if len(rows) == len(memory):
+        return advanced(model, recorded.x, recorded.u, memory)[0]
+    predicted = np.array(model.step(recorded.x, recorded.u))
     predicted[rows] = advanced(model, recorded.x[rows], recorded.u[rows], memory[rows])[0]
     return predicted
 

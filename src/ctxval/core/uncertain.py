@@ -51,8 +51,8 @@ def uncertain_in(model: Model) -> UncertainModel | None:
 def prior_of(name: str, value: float, given: float | str) -> UncertainParameter:
     """Return a parameter whose deviation is a number in its own unit or, as in ``"20 %"``, a share of its value.
 
-    A parameter that is 0 and stands for a friction, a drag or a mass keeps its sign only with a share; a number lets
-    it have both. An InputError is raised for a deviation that is not positive, and for a share of 0.
+    With a share, the value keeps its sign. An InputError is raised for a deviation that is not positive, and for a
+    share of 0.
     """
     text = str(given).strip()
     relative = text.endswith("%")

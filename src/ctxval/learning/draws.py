@@ -61,6 +61,21 @@ class Draws(ShortRepr, ABC):
 class DrawsWithoutNoise(Draws):
     """Systems whose next states follow from states and inputs."""
 
+    def __getitem__(self, rows: ArrayLike) -> Self:
+        """Return some draws; their rows are in ascending order."""
+        rows = np.atleast_1d(np.asarray(rows, dtype=np.intp))
+        if not (rows < len(self)).all():
+            raise IndexError(f"there are {len(self)} draws.")
+        return self if len(rows) == len(self) else self._some(rows)
+
+    @abstractmethod
+    def _some(self, rows: Rows) -> Self:
+        """Return fewer draws than all."""
+
+    def _of_draws(self, part: Array) -> Array:
+        """Return states, inputs or memories ``(..., k)`` with the draws as the first axis, ``(S, q, k)``."""
+        return part.reshape(len(self), math.prod(part.shape[:-1]) // len(self), part.shape[-1])
+
     @abstractmethod
     def step(self, x: Array, u: Array) -> Array:
         """Return the next states, ``(..., n), (..., m) -> (..., n)``, equally many of each draw, draw after draw."""
@@ -95,13 +110,7 @@ class DynamicsDraws(DrawsWithoutNoise):
     def __len__(self) -> int:
         return sum(len(expansion.weights) for expansion in self.expansions)
 
-    def __getitem__(self, rows: ArrayLike) -> Self:
-        """Return some draws; their rows are in ascending order."""
-        rows = np.atleast_1d(np.asarray(rows, dtype=np.intp))
-        if not (rows < len(self)).all():
-            raise IndexError(f"there are {len(self)} draws.")
-        if len(rows) == len(self):
-            return self
+    def _some(self, rows: Rows) -> Self:
         firsts = np.cumsum([0, *(len(each.weights) for each in self.expansions)])
         chosen = [rows[(rows >= first) & (rows < last)] - first for first, last in pairwise(firsts)]
         kept = tuple(each[some] for each, some in zip(self.expansions, chosen, strict=True) if len(some))
@@ -123,17 +132,14 @@ class DynamicsDraws(DrawsWithoutNoise):
 
     def _following(self, x: Array, u: Array, memory: Any) -> tuple[Array, Any]:
         shape = x.shape
-        of_each = math.prod(shape[:-1]) // len(self)
-        # There may be no inputs.
-        x, u, acting = (part.reshape(len(self), of_each, part.shape[-1]) for part in (x, u, u[..., : self.data.inputs]))
+        x, acting = map(self._of_draws, (x, u[..., : self.data.inputs]))
         with np.errstate(all="ignore"):
             if isinstance(self.model, DryFriction):
                 following = self.model.following(x, acting, lambda inputs: self.residuals(x, inputs))
             elif memory is None:
                 following = self.model.step(x, acting) + self.residuals(x, acting)
             else:
-                given = memory.reshape(*x.shape[:2], memory.shape[-1])
-                following, given = advanced(self.model, x, acting, given)
+                following, given = advanced(self.model, x, acting, self._of_draws(memory))
                 following, memory = following + self.residuals(x, acting), given.reshape(memory.shape)
             return following.reshape(shape), memory
 
@@ -163,9 +169,8 @@ class DisturbedDynamics(DrawsWithoutNoise):
     def __len__(self) -> int:
         return len(self.ways)
 
-    def __getitem__(self, rows: ArrayLike) -> Self:
-        """Return some of the ways."""
-        return replace(self, ways=self.ways[np.atleast_1d(rows)])
+    def _some(self, rows: Rows) -> Self:
+        return replace(self, ways=self.ways[rows])
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next states; see :class:`DrawsWithoutNoise`."""
@@ -181,7 +186,7 @@ class DisturbedDynamics(DrawsWithoutNoise):
         return self._moved(x, x_next), memory
 
     def _moved(self, x: Array, x_next: Array) -> Array:
-        together = x.reshape(len(self), math.prod(x.shape[:-1]) // len(self), x.shape[-1])
+        together = self._of_draws(x)
         return np.asarray((x_next.reshape(together.shape) + self.added(self.ways, together)).reshape(x.shape))
 
 

@@ -115,23 +115,14 @@ class ParameterPosterior(ShortRepr):
         moves = rng.standard_normal((count, len(self.mean))) @ root.T
         return np.asarray(self.samples[rows] + self.settings.jitter * moves)
 
-    @property
-    def effective(self) -> float:
-        """The effective number of samples."""
-        return float(1 / (self.weights**2).sum())
-
 
 def parameter_posterior(
     model: UncertainModel,
     segments: Segments,
     rng: np.random.Generator,
-    start: Array | None = None,
     settings: ParameterSettings = ParameterSettings(),
 ) -> ParameterPosterior:
-    """Return the posterior of standardised parameters given segments of executions.
-
-    Gauss-Newton steps begin at values ``start`` ``(K,)`` that an earlier posterior found, and at those of the model.
-    """
+    """Return the posterior of standardised parameters given segments of executions."""
     K = len(model.uncertain)
 
     def squares(z: Array) -> Array:
@@ -149,12 +140,8 @@ def parameter_posterior(
         """Return the variance of errors that a Student likelihood has with its usual segments."""
         return max(float(np.median(of_segments)) / 0.8, settings.floor**2)
 
-    starts = np.zeros((1, K)) if start is None else np.stack([np.zeros(K), start])
-    first = squares(starts)
-    variance = min(map(usual, first))
-    best = int(surprise(first, starts, variance).argmin())
-    z, here = starts[best], first[best]
-    precision = np.eye(K)
+    z, precision = np.zeros(K), np.eye(K)
+    of_model = here = squares(z[None])[0]
     for _ in range(settings.newton):
         h = settings.difference * np.eye(K)
         errors = segments.errors(model.drawn(np.concatenate([z + h, z - h, z[None]])), 2 * K + 1)
@@ -191,7 +178,7 @@ def parameter_posterior(
         mean = weights @ samples
         spread = samples - mean
         covariance = (spread * weights[:, None]).T @ spread + 0.1 * covariance
-    left = float(np.minimum(squares(mean[None])[0], 10.0).mean() / max(np.minimum(first[0], 10.0).mean(), 1e-300))
+    left = float(np.minimum(squares(mean[None])[0], 10.0).mean() / max(np.minimum(of_model, 10.0).mean(), 1e-300))
     return ParameterPosterior(model, mean, np.asarray(covariance, dtype=np.float64), samples, weights, left, settings)
 
 

@@ -8,16 +8,15 @@ state is learned only if it predicts left-out executions, so that nothing that i
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, Rows, single_threaded
+from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.representation import ShortRepr
-from ctxval.core.model import Model, advanced, memory_in, with_memory
+from ctxval.core.model import Model, advanced, memory_in, predicted_steps, with_memory
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.uncertain import UncertainModel
 from ctxval.learning.draws import DrawsWithoutNoise
@@ -79,7 +78,7 @@ def rest_of(
     before = np.concatenate([np.concatenate([each.u[:1], each.u[:-1]]) for each in steps])
     source = np.repeat(np.arange(len(steps)), [len(each) for each in steps])
     with np.errstate(all="ignore"):
-        errors = np.concatenate([each.x_next - _reached(model, each) for each in steps])
+        errors = np.concatenate([each.x_next - predicted_steps(model, each) for each in steps])
     x, u = (np.concatenate([getattr(each, name) for each in steps]) for name in ("x", "u"))
     if not (finite := np.isfinite(errors).all(axis=1)).any():
         return None
@@ -110,11 +109,6 @@ def rest_of(
     return replace(rest, weights=weights, root=root, deviations=deviations, rests=rests, lengths=lengths)
 
 
-def _reached(model: Model, steps: Transitions) -> Array:
-    memory = np.empty((len(steps), 0)) if steps.memory is None else steps.memory
-    return advanced(model, steps.x, steps.u, memory)[0]
-
-
 @dataclass(frozen=True, eq=False)
 class ParametricDraws(DrawsWithoutNoise):
     """S systems with drawn parameters, residuals and rests, run together."""
@@ -129,13 +123,7 @@ class ParametricDraws(DrawsWithoutNoise):
     def __len__(self) -> int:
         return len(self.z)
 
-    def __getitem__(self, rows: ArrayLike) -> Self:
-        """Return some draws; their rows are in ascending order."""
-        rows = np.atleast_1d(np.asarray(rows, dtype=np.intp))
-        if not (rows < len(self)).all():
-            raise IndexError(f"there are {len(self)} draws.")
-        if len(rows) == len(self):
-            return self
+    def _some(self, rows: Rows) -> Self:
         return replace(self, z=self.z[rows], weights=self.weights[rows], rows=self.rows[rows])
 
     @functools.cached_property
@@ -172,9 +160,6 @@ class ParametricDraws(DrawsWithoutNoise):
             following = following + self.rest.rests[at][:, None]
         memory = np.concatenate([step + 1, inputs, of_model], axis=-1).reshape(memory.shape)
         return np.asarray(following).reshape(x.shape), memory
-
-    def _of_draws(self, part: Array) -> Array:
-        return part.reshape(len(self), math.prod(part.shape[:-1]) // len(self), part.shape[-1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,7 +263,7 @@ class ParametricDynamics(LearnedDynamics):
         """Whether rests matter, so that predictions are distributions."""
         return self.scatter > self.drawn_from.settings.matters
 
-    @property
+    @functools.cached_property
     def values(self) -> dict[str, tuple[float, float, float]]:
         """The median and the 5 % and 95 % quantiles of each parameter by its name."""
         drawn = self.drawn_from.parameters.draw(400, self._rng(10))
@@ -302,7 +287,6 @@ def learned_parameters(
     executed: Sequence[Trajectory],
     recorded: tuple[Transitions, Rows],
     seed: tuple[int, ...],
-    start: Array | None = None,
     settings: ParametricSettings = ParametricSettings(),
 ) -> ParametricPosterior | None:
     """Return the posterior of a model's uncertain parameters and of what they leave; None if nothing is usable."""
@@ -311,7 +295,7 @@ def learned_parameters(
         segments = Segments.of(model, executed, rng, settings.parameters)
         if segments is None:
             return None
-        parameters = parameter_posterior(model, segments, rng, start, settings.parameters)
+        parameters = parameter_posterior(model, segments, rng, settings.parameters)
         fitted = _Single(model.drawn(parameters.mean[None]))
         rest, plain = rest_of(fitted, executed, settings), agreeing_posterior(fitted, *recorded, seed)
     if rest is None or plain is None:

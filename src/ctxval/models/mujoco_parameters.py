@@ -87,9 +87,7 @@ def _parameter(compiled: Any, name: str, deviation: float | str) -> MuJoCoParame
     places = []
     for field, components in quantity.fields:
         values = _values(compiled, field)
-        at: tuple[Any, ...] = (
-            (rows,) if quantity.element == "joint" and field.startswith("jnt") else (_of_field(compiled, field, rows),)
-        )
+        at: tuple[Any, ...] = (_of_field(compiled, field, rows),)
         if components:
             at = at if values.ndim > 1 else ()
             at = (*(each[:, None] for each in at), np.array(components))

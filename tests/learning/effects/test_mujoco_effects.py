@@ -10,17 +10,11 @@ from ctxval.learning import effects
 from ctxval.learning.effects import Joint
 from ctxval.learning.effects.flow import Flow
 from ctxval.learning.effects.plant import plant_of
+from hinge import mjcf
 
 pytest.importorskip("mujoco")
 
 DT = 0.02
-
-
-def mjcf(joint: str = "", mass: float = 0.5, gear: float = 1.0) -> str:
-    return f"""<mujoco><option timestep="0.005"/><worldbody><body name="link">
-      <joint name="hinge" type="hinge" axis="0 1 0" damping="0.05" {joint}/>
-      <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="{mass}"/>
-    </body></worldbody><actuator><motor name="motor" joint="hinge" gear="{gear}"/></actuator></mujoco>"""
 
 
 def test_a_changed_copy_leaves_the_model_as_it_is() -> None:

@@ -7,18 +7,12 @@ import pytest
 
 from ctxval import Campaign, Parameters, Task, TaskSpace, Validation, controllers, distances, models, searches, systems
 from ctxval.studies.causes import CauseReport, find_causes
+from hinge import mjcf
 from rig_thorough import more
 
 pytest.importorskip("mujoco")
 
 DT = 0.02
-
-
-def mjcf(joint: str = "", mass: float = 0.5, gear: float = 1.0) -> str:
-    return f"""<mujoco><option timestep="0.005"/><worldbody><body name="link">
-      <joint name="hinge" type="hinge" axis="0 1 0" damping="0.05" {joint}/>
-      <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="{mass}"/>
-    </body></worldbody><actuator><motor name="motor" joint="hinge" gear="{gear}"/></actuator></mujoco>"""
 
 
 def reach(p: Parameters) -> Task:
