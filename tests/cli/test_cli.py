@@ -585,7 +585,7 @@ def test_status_and_cases_speak_to_people_and_to_programs(invoke) -> None:  # ty
 
 @pytest.mark.slow
 def test_a_store_is_certified_against_the_threshold_of_its_file(invoke) -> None:  # type: ignore[no-untyped-def]
-    settings = 'budget = 5\nthreshold = 0.01\nexplore = true\nsearch = { name = "gp-ucb" }'
+    settings = 'budget = 5\nthreshold = 0.01\nexplore = true\nsearch = { type = "gp-ucb" }'
     Path("e.toml").write_text(f'experiment = "rig:experiment"\nstore = "e.sqlite"\n{settings}')
     assert invoke("run", "e.toml").exit_code == 1
     result = invoke("certify", "e.sqlite", "--json")

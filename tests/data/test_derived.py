@@ -55,7 +55,7 @@ def test_a_state_that_is_not_recorded_is_made_good_by_the_past() -> None:
         logs.append(MemoryTable("run", {"t": T, "y": x[:, 0], "u": u}))
 
     def error(lags: int) -> float:
-        mapping = LogMapping.from_table({"states": ["y"], "inputs": ["u"], "lags": lags})
+        mapping = LogMapping.from_table({"states": {"y": "y"}, "inputs": {"u": "u"}, "lags": lags})
         return fit(recordings_of(logs, mapping), ["linear"]).fitted[0].errors[0].relative
 
     assert error(0) > 0.1
@@ -79,9 +79,9 @@ def test_recordings_that_are_too_short_are_left_out_and_said() -> None:
         ({"states": {"y": "y", "v": {"derivative_of": "z"}}}, ("v", "z")),
         ({"states": {"y": "y", "v": {"derivative_of": "y", "path": "u"}}}, ("v", "y")),
         ({"states": {"y": "y", "v": {"derivative_of": "y", "window": 4}}}, ("window", "v")),
-        ({"states": ["y"], "inputs": {"v": {"derivative_of": "y"}}}, ("v",)),
-        ({"states": ["y"], "lags": -1}, ("lags", 0)),
-        ({"states": ["y"], "lags": 1.5}, ("lags", 0)),
+        ({"states": {"y": "y"}, "inputs": {"v": {"derivative_of": "y"}}}, ("v",)),
+        ({"states": {"y": "y"}, "lags": -1}, ("lags", 0)),
+        ({"states": {"y": "y"}, "lags": 1.5}, ("lags", 0)),
     ],
 )
 def test_what_cannot_be_derived_is_refused(mapping: dict[str, Any], facts: tuple[object, ...]) -> None:

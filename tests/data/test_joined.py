@@ -102,7 +102,7 @@ def test_a_field_of_several_topics_is_named_with_its_topic(tmp_path: Path) -> No
     (run,) = read_recordings([tmp_path], LogMapping.from_table({"states": {"v": {"path": "right.speed"}}})).runs
     np.testing.assert_allclose(run.trajectory.states[:, 0], -run.trajectory.times, atol=1e-6)
     with refuses(InputError, "speed"):
-        read_recordings([tmp_path], LogMapping.from_table({"states": ["speed"]}))
+        read_recordings([tmp_path], LogMapping.from_table({"states": {"speed": "speed"}}))
 
 
 def test_recordings_with_a_field_in_common_are_not_joined(tmp_path: Path) -> None:

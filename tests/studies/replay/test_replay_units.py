@@ -30,7 +30,12 @@ def read(scale: float = 1.0, heads: tuple[str, str, str] = ("angle", "rate", "to
     for k, one in enumerate(RUNS):
         columns = {heads[0]: scale * one.states[:, 0], heads[1]: scale * one.states[:, 1], heads[2]: one.inputs}
         logs.append(MemoryTable(f"run {k}", {"t": one.times, **columns}))
-    return recordings_of(logs, LogMapping.from_table({"states": ["angle", "rate"], "inputs": ["torque"], **options}))
+    return recordings_of(
+        logs,
+        LogMapping.from_table(
+            {"states": {"angle": "angle", "rate": "rate"}, "inputs": {"torque": "torque"}, **options}
+        ),
+    )
 
 
 PLAIN, RAD, DEG = (
