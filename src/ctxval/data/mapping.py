@@ -231,6 +231,8 @@ def _field(name: str, described: Any) -> Field:
             return Field(described)
     if not isinstance(described, Mapping):
         raise InputError(f"the field {name} must be a path or a table, got {described!r}.")
+    if "field" in described:
+        raise InputError(f"the field {name} has a path in place of a field: path = {described['field']!r}.")
     require_known(f"entry of the field {name}", described, [field.name for field in fields(Field)])
     with reworded(f"the field {name}", InputError):
         return Field(**({} if "derivative_of" in described else {"path": name}) | described)

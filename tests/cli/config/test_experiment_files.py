@@ -267,7 +267,7 @@ def test_the_file_says_the_largest_horizon_that_is_planned(invoke: Any, target: 
 @pytest.mark.slow
 def test_the_certificate_of_the_file_is_what_run_and_certify_judge_by(invoke: Any) -> None:
     scenario = ('kind = "auto"', 'kind = "scenario"\nvolume = 0.5')
-    target = changed(scenario, ('type = "auto"', 'name = "random"'))
+    target = changed(scenario, ('type = "auto"', 'type = "random"'))
     run = json.loads(invoke("run", target, "--no-report", "--json").stdout)
     assert (run["verdict"], run["certificate"]["kind"]) == ("validated", "scenario")
     certified = json.loads(invoke("certify", run["store"], "--threshold", "0.5", "--json").stdout)
@@ -559,7 +559,7 @@ def test_a_model_is_learned_from_logs_with_a_mapping(tmp_path: Path) -> None:
     model = part("model", {"type": "Linear", "data": {"logs": ["run.mcap"], **mapping}}, tmp_path)
     np.testing.assert_allclose(model.A, [[1, DT], [0, 1 - 0.3 * DT]], atol=1e-9)
     assert len(model.data) == 60
-    with refuses(InputError, "data", "None"):
+    with refuses(InputError, "data", "logs"):
         part("model", {"type": "Linear", "data": mapping}, tmp_path)
     with refuses(InputError, "run.mcap", "observation.state"):
         part("model", {"type": "Linear", "data": {"logs": ["run.mcap"]}}, tmp_path)
@@ -691,7 +691,9 @@ FILTERED = (
 )
 
 
-@pytest.mark.parametrize(("outputs", "synthesizer"), [*more(("[0]", PID), ("[0]", FILTERED)), ('"angles:angle"', PID)])
+@pytest.mark.parametrize(
+    ("outputs", "synthesizer"), [*more(("[0]", PID), ("[0]", FILTERED)), ('{ ref = "angles:angle" }', PID)]
+)
 def test_outputs_are_indices_or_a_function_of_a_module(outputs: str, synthesizer: str, invoke: Any) -> None:
     sys.modules.pop("angles", None)
     Path("angles.py").write_text(

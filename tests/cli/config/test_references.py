@@ -171,14 +171,14 @@ def test_pythons_own_library_has_no_parts(name: str) -> None:
 def test_a_task_by_name_is_a_function_of_the_parameters() -> None:
     space = TaskSpace(goal=(0.0, 1.0))
     for name in ("task", "cached"):
-        assert callable(task_function(f"parts_here:{name}", space, None))
+        assert callable(task_function({"ref": f"parts_here:{name}"}, space, None))
     for name, facts in (
         ("step", ()),
         ("Rig", ("parts_here.Rig",)),
         ("builtin", ("builtin",)),
     ):
         with pytest.raises(InputError) as refused:
-            task_function(f"parts_here:{name}", space, None)
+            task_function({"ref": f"parts_here:{name}"}, space, None)
         assert_names(str(refused.value), *facts)
     assert calls() == []
 
@@ -247,7 +247,7 @@ def described(folder: Path, value: str, module: str = "step_here") -> Path:
         'name = "x"\nspace = { goal = [0.0, 1.0] }\n'
         'task = { initial_state = [0.0], goal = ["goal"], horizon = 3, dt = 0.1 }\n'
         f'system = {{ type = "Simulated", step = {{ ref = "{module}:step" }} }}\n'
-        'model = { type = "Linear", data = ["run.csv"] }\n'
+        'model = { type = "Linear", data = { logs = ["run.csv"] } }\n'
         'synthesizer = { type = "LQR", Q = [1.0], R = [1.0] }\n'
     )
     return folder / "experiment.toml"

@@ -379,7 +379,7 @@ def test_what_the_user_names_may_be_of_an_installed_package(site: Path) -> None:
     done("ask", "a.sqlite")  # it is the user's own store
     shutil.rmtree(allowed_folder())
     said = refusal("ask", "a.sqlite")  # it is not any more
-    assert "distance = {'type': 'Speed'}; search = {'type': 'corners', 'repeats': 1}" in said
+    assert "distance = {'type': 'Speed'}; search = {'repeats': 1, 'type': 'corners'}" in said
     done("ask", "a.sqlite", "--trust")
     done("ask", "a.sqlite")
 
@@ -438,11 +438,11 @@ def test_seed_and_search_remain_the_stores(folder: Path) -> None:
     kept = Store("a.sqlite").settings()
     shutil.rmtree(allowed_folder())
     done("ask", "a.sqlite", "--experiment", "my_rig:experiment")
-    assert (Store("a.sqlite").settings()["seed"], Store("a.sqlite").settings()["search"]["name"]) == (3, "random")
+    assert (Store("a.sqlite").settings()["seed"], Store("a.sqlite").settings()["search"]["type"]) == (3, "random")
     # but code is not taken along
     search = {"type": "random", "kernel": {"ref": "evil:kernel"}}
     Store("a.sqlite").keep_settings({**kept, "search": search})
-    assert trusted_settings(Store("a.sqlite"), experiment="pendulum").search.name == "auto"
+    assert trusted_settings(Store("a.sqlite"), experiment="pendulum").search.type == "auto"
 
 
 def test_a_store_that_says_nothing_can_be_named(folder: Path) -> None:

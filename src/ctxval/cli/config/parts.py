@@ -153,7 +153,7 @@ def _component(entry: float | str, p: Parameters) -> Any:
 def task_function(given: Mapping[str, Any], space: TaskSpace, system: Any, folder: Path | None = None) -> Any:
     """Return the map p -> task of an experiment file, from the reference of a function or from components."""
     if set(given) == {"ref"}:
-        return require_function(f"the task {given['ref']}", argument(given, folder), "p -> Task")
+        return require_function(f"the task {given['ref']}", reference(str(given["ref"]), folder), "p -> Task")
     require_known("entry of [task]", given, (*TaskTable.__dataclass_fields__, COMMAND))
     table = {"goal": None, "dt": getattr(system, "dt", None), **given}
     missing = [key for key in ("initial_state", "horizon", "dt") if table.get(key) is None]

@@ -22,7 +22,7 @@ from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE, MOST_VOLUM
 from ctxval.certificates.prediction_tests import TESTS
 from ctxval.cli.config import parts
 from ctxval.cli.config.parts import argument, part, require_types
-from ctxval.cli.config.references import require_function
+from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.trust import allow
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.quantiles import QUANTILE
@@ -223,7 +223,8 @@ class ExperimentSettings(BaseModel, extra="forbid"):
         space = TaskSpace(**box) if tasks is None else TaskSuite(tasks)
         outputs: Any = self.outputs
         if isinstance(self.outputs, dict):
-            outputs = require_function("outputs", argument(self.outputs, self.folder), "x -> y")
+            require_known("entry of outputs", self.outputs, ["ref"])
+            outputs = require_function("outputs", reference(self.outputs.get("ref", ""), self.folder), "x -> y")
         default: Part = {"type": "FinalState"}
         if self.spec is not None:  # d_a, of the states that the specification looks at
             default = {"type": "MaximumDeviation", "components": (self.spec.model_extra or {}).get("components")}
