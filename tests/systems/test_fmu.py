@@ -301,7 +301,7 @@ def test_a_step_that_does_not_end_goes_with_a_campaign_that_is_killed(tmp_path: 
     code = f"""
 from ctxval import Task
 from ctxval.systems import FMU
-system = FMU({str(built(tmp_path, "pythonfmu", CART_2.replace(FAILING, hang)))!r}, 
+system = FMU({str(built(tmp_path, "pythonfmu", CART_2.replace(FAILING, hang)))!r},
              states={{"position": "", "speed": ""}}, inputs={{"force": ""}})
 system.execute(lambda t, x: -x[:1], Task([1.0, 200.0], horizon=5, dt=0.1))
 """

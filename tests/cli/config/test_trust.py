@@ -193,7 +193,7 @@ def test_the_store_of_the_attack_runs_nothing_through_the_real_command_line(fold
     for process in started:
         said = process.communicate(timeout=60)[1]
         assert process.returncode == 2
-        assert "task = 'os:getcwd'" in said.replace("\n", " ")
+        assert "task = {'ref': 'os:getcwd'}" in said.replace("\n", " ")
         assert "id > PWNED" in said
     assert not list(folder.glob("PWNED*"))
 

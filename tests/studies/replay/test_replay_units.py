@@ -80,7 +80,7 @@ def test_a_model_file_states_units_and_logs_are_converted_to_them(suffix: str, t
 
 
 def test_states_in_another_order_are_taken_by_their_names() -> None:
-    turned = read(heads=("angle [rad]", "rate [rad/s]", "torque [N m]"), states=["rate", "angle"])
+    turned = read(heads=("angle [rad]", "rate [rad/s]", "torque [N m]"), states={"rate": "rate", "angle": "angle"})
     assert list(turned.states) == ["rate", "angle"]
     assert max(error.relative for error in replay(learned(RAD), turned, steps=[1]).errors) < 1e-3
 
