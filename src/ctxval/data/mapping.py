@@ -235,4 +235,4 @@ def _field(name: str, described: Any) -> Field:
         raise InputError(f"the field {name} has a path in place of a field: path = {described['field']!r}.")
     require_known(f"entry of the field {name}", described, [field.name for field in fields(Field)])
     with reworded(f"the field {name}", InputError):
-        return Field(**({} if "derivative_of" in described else {"path": name}) | described)
+        return Field(**{**({} if "derivative_of" in described else {"path": name}), **described})
