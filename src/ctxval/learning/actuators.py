@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from ctxval._util.arrays import Array
 from ctxval.core.controller import Controller, memory_of, stepped
@@ -90,7 +90,9 @@ def found_actuator(
         at = np.array([start.delay, start.lag])
         simplex = at + np.array([[0.0, 0.0], [0.25, 0.0], [0.0, 0.25]])
         options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-5, "fatol": 1e-3}
-        best = np.clip(minimize(unlikely, at, method="Nelder-Mead", options=options).x, 0.0, settings.longest)
+        best = np.clip(
+            scipy.optimize.minimize(unlikely, at, method="Nelder-Mead", options=options).x, 0.0, settings.longest
+        )
         # Whole steps and no lag are preferred as by the Bayesian information criterion.
         whole, each = np.array([np.round(best[0]), best[1]]), 0.5 * np.log(len(rows))
         near = [(best, 2), (whole, 1), (best * [1, 0], 1), (whole * [1, 0], 0)]
