@@ -101,21 +101,27 @@ def read_dataflash(path: Path) -> list[Log]:
 
     A topic is a message such as ``ATT``, or ``IMU_0`` of the instance 0. Columns have the units that the log states.
     """
-    library = require_extra("pymavlink.DFReader", "logs", "logs of ArduPilot need")
+    kind = require_extra("pymavlink.DFReader", "logs", "logs of ArduPilot need").DFReader_binary
+    reader = kind.__new__(kind)  # apart from __init__, because a reader that fails keeps its file open
     rows: dict[str, list[dict[str, float]]] = {}
     units: dict[str, dict[str, str]] = {}
     said = io.StringIO()
     with reading(path, "a DataFlash log"), redirect_stdout(said), redirect_stderr(said):  # pymavlink prints warnings
         require_regular_file(path)
-        reader = library.DFReader_binary(str(path))
-        while (message := reader.recv_msg()) is not None:
-            kind, content = message.fmt, message.to_dict()
-            if "TimeUS" in content:
-                numbered = "" if kind.instance_field is None else f"_{content[kind.instance_field]}"
-                numbers = {name: value for name, value in content.items() if isinstance(value, int | float)}
-                rows.setdefault(f"{kind.name}{numbered}", []).append(numbers)
-                stated = {name: kind.get_unit(name) for name in numbers}
-                units[f"{kind.name}{numbered}"] = {n: unit for n, unit in stated.items() if unit and is_unit(unit)}
+        try:
+            reader.__init__(str(path))
+            while (message := reader.recv_msg()) is not None:
+                about, content = message.fmt, message.to_dict()
+                if "TimeUS" in content:
+                    numbers = {name: value for name, value in content.items() if isinstance(value, int | float)}
+                    stated = {name: about.get_unit(name) for name in numbers}
+                    topic = about.name + (f"_{content[about.instance_field]}" if about.instance_field else "")
+                    rows.setdefault(topic, []).append(numbers)
+                    units[topic] = {name: unit for name, unit in stated.items() if unit and is_unit(unit)}
+        finally:
+            for opened in ("data_map", "filehandle"):
+                if hasattr(reader, opened):
+                    getattr(reader, opened).close()
     tables = {}
     for topic, messages in rows.items():
         names = [name for name in messages[0] if name != "TimeUS"]
