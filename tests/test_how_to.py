@@ -39,7 +39,8 @@ NEEDS |= {"operate": ["starlette", "uvicorn", "jinja2", "python_multipart"]}
 LONG = ("aspect1", "causes", "clusters", "compare-controllers", "controllers", "envelope", "fit")
 LONG += ("gymnasium-and-network", "noise", "outputs", "retrain", "safety")
 LONG += ("choose-threshold", "decide", "experiment-file", "fmu", "operate", "report", "start", "watch", "workers")
-LONG += ("policy-and-mjcf", "pybullet", "replay")  # replay: an example and a script of the gallery replay recordings, too
+LONG += ("policy-and-mjcf", "pybullet")
+LONG += ("replay",)  # an example and a script of the gallery replay recordings, too
 """Pages that only `make docs` and `make thorough` run: long campaigns, several of them, or many processes."""
 CTXVAL = ["-c", "from ctxval.cli import main; main()"]
 

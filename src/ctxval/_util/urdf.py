@@ -13,8 +13,8 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask
 from ctxval.errors import InputError
 
-_PLANE, _SPHERE, _CAPSULE, _CYLINDER, _BOX, _MESH = 0, 2, 3, 5, 6, 7  # mjtGeom
-_FREE, _BALL, _SLIDE = 0, 1, 2  # mjtJoint
+_SHAPES = ("plane", "height field", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")  # mjtGeom
+_JOINTS = ("free", "ball", "slide", "hinge")  # mjtJoint
 _NOWHERE, _UNTURNED = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -41,9 +41,8 @@ def trees_of(model: Any, folder: Path) -> list[Tree]:
 
     if model.neq:
         raise InputError("equality constraints of an MJCF cannot be converted: remove them.")
-    if (model.jnt_type == _BALL).any():
-        names = [model.joint(int(k)).name for k in np.flatnonzero(model.jnt_type == _BALL)]
-        raise InputError(f"ball joints of an MJCF cannot be converted: {', '.join(names)}.")
+    if balls := [model.joint(k).name for k, kind in enumerate(model.jnt_type) if _JOINTS[kind] == "ball"]:
+        raise InputError(f"ball joints of an MJCF cannot be converted: {', '.join(balls)}.")
     at_rest, weld, trees = mujoco.MjData(model), model.body_weldid, []
     mujoco.mj_kinematics(model, at_rest)
     for geom in np.flatnonzero(_collide(model) & (weld[model.geom_bodyid] == 0)):
@@ -53,7 +52,7 @@ def trees_of(model: Any, folder: Path) -> list[Tree]:
         link = _link(f"g{geom}", shape, model.geom_friction[geom, 0])
         trees.append(Tree(_robot(link), True, at_rest.geom_xpos[geom].copy(), quaternion, is_geom=True))
     for root in np.flatnonzero((weld != 0) & (weld[model.body_parentid] == 0)):
-        free = bool(model.jnt_type[model.body_jntadr[root]] == _FREE)
+        free = _JOINTS[model.jnt_type[model.body_jntadr[root]]] == "free"
         base = root if free else model.body_parentid[root]
         links = "".join(_links(model, root, folder, _NOWHERE))
         robot = _robot(links if free else _link(f"b{base}") + links)
@@ -95,7 +94,7 @@ def _links(model: Any, body: Any, folder: Path, parent_anchor: Array) -> Iterato
     Several joints of a body are a chain of links without mass.
     """
     parent, first = f"b{model.body_parentid[body]}", model.body_jntadr[body]
-    joints = [k for k in range(first, first + model.body_jntnum[body]) if model.jnt_type[k] != _FREE]
+    joints = [k for k in range(first, first + model.body_jntnum[body]) if _JOINTS[model.jnt_type[k]] != "free"]
     place, quaternion, anchor = model.body_pos[body] - parent_anchor, model.body_quat[body], _NOWHERE
     for joint in joints:
         moved = model.jnt_pos[joint] - anchor
@@ -160,7 +159,7 @@ def _link(name: str, shapes: str = "", friction: float = 0.0, inertial: str = _M
 
 
 def _joint(model: Any, joint: int, parent: str, child: str, origin: str) -> str:
-    slides, limited = model.jnt_type[joint] == _SLIDE, bool(model.jnt_limited[joint])
+    slides, limited = _JOINTS[model.jnt_type[joint]] == "slide", bool(model.jnt_limited[joint])
     kind = "prismatic" if slides else "revolute" if limited else "continuous"
     low, high = model.jnt_range[joint] - model.qpos0[model.jnt_qposadr[joint]] if limited else (0.0, -1.0)
     dof = model.jnt_dofadr[joint]
@@ -170,19 +169,19 @@ def _joint(model: Any, joint: int, parent: str, child: str, origin: str) -> str:
 
 
 def _shape(model: Any, geom: Any, place: Array, quaternion: Array, folder: Path) -> str:
-    kind, mesh, (a, b, c) = model.geom_type[geom], model.geom_dataid[geom], model.geom_size[geom]
+    kind, mesh, (a, b, c) = _SHAPES[model.geom_type[geom]], model.geom_dataid[geom], model.geom_size[geom]
     shapes = {
-        _PLANE: '<plane normal="0 0 1"/>',
-        _SPHERE: f'<sphere radius="{a}"/>',
-        _CAPSULE: f'<capsule radius="{a}" length="{2 * b}"/>',
-        _CYLINDER: f'<cylinder radius="{a}" length="{2 * b}"/>',
-        _BOX: f'<box size="{2 * a} {2 * b} {2 * c}"/>',
-        _MESH: f'<mesh filename="m{mesh}.obj"/>',
+        "plane": '<plane normal="0 0 1"/>',
+        "sphere": f'<sphere radius="{a}"/>',
+        "capsule": f'<capsule radius="{a}" length="{2 * b}"/>',
+        "cylinder": f'<cylinder radius="{a}" length="{2 * b}"/>',
+        "box": f'<box size="{2 * a} {2 * b} {2 * c}"/>',
+        "mesh": f'<mesh filename="m{mesh}.obj"/>',
     }
     if kind not in shapes:
         name = model.geom(int(geom)).name or int(geom)
-        raise InputError(f"the shape of the geom {name} cannot be converted: take a capsule, a box or a mesh.")
-    if kind == _MESH:
+        raise InputError(f"the {kind} {name} cannot be converted: take a capsule, a box or a mesh.")
+    if kind == "mesh":
         points = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
         faces = model.mesh_face[model.mesh_faceadr[mesh] :][: model.mesh_facenum[mesh]] + 1
         lines = [*(f"v {_text(each)}" for each in points), *(f"f {_text(each)}" for each in faces)]
