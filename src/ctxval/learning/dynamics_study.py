@@ -33,6 +33,7 @@ from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, schedule, scheduled
 from ctxval.learning.regular import RegularSettings, split_transitions
 from ctxval.learning.stage_costs import Costs, Ledger, ThinkingSettings, reduced
+from ctxval.learning.task_share import ShareSearch
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
@@ -72,6 +73,7 @@ class DynamicsStudy(ShortRepr):
         validation: the same with the states of M if only outputs are recorded, and with the physical task parameters
             as further states; everything is learned of these.
         quantile: the share of the executions of a task that a distance is about, if the system is noisy.
+        share: the share of the tasks whose distances are asked for; 1 for the largest one.
         actuator: how the m inputs act; None if they act at once.
         friction: M with the dry friction that it lacks, of which the residual is learned; None without.
         settings: the numbers that decide what is learned.
@@ -85,8 +87,9 @@ class DynamicsStudy(ShortRepr):
         extended: ExtendedValidation | None = None,
         friction: DryFriction | None = None,
         settings: LearningSettings | None = None,
+        share: float = 1.0,
     ) -> None:
-        self.settings = settings or LearningSettings()
+        self.settings, self.share = settings or LearningSettings(), share
         self.given, self.seed, self.quantile, self.friction = validation, seed, quantile, friction
         self.extended = ExtendedValidation(validation) if extended is None else extended
         self.actuator, self.validation = self.extended.actuator, self.extended.validation
@@ -102,15 +105,16 @@ class DynamicsStudy(ShortRepr):
         #: largest distances of tasks if M errs by so much in each step, of each error and task
         self.under_errors: dict[bytes, dict[bytes, float]] = {}
 
-    def fresh_copy(self, quantile: float | None = None) -> DynamicsStudy:
-        """Return a study of the same experiment that has learned nothing yet, with a quantile if it is given."""
+    def fresh_copy(self, quantile: float | None = None, share: float | None = None) -> DynamicsStudy:
+        """Return a study of the same experiment that has learned nothing yet, with what is given."""
         quantile = self.quantile if quantile is None else quantile
-        return DynamicsStudy(self.given, self.seed, quantile, settings=self.settings)
+        share = self.share if share is None else share
+        return DynamicsStudy(self.given, self.seed, quantile, settings=self.settings, share=share)
 
     def _with(
         self, given: Validation, extended: ExtendedValidation, friction: DryFriction | None = None
     ) -> DynamicsStudy:
-        return DynamicsStudy(given, self.seed, self.quantile, extended, friction, self.settings)
+        return DynamicsStudy(given, self.seed, self.quantile, extended, friction, self.settings, self.share)
 
     def state_of_parts(self) -> tuple[str, bytes]:
         """Return the description of M and the synthesizer, and some steps of M, which a description may not show."""
@@ -125,11 +129,13 @@ class DynamicsStudy(ShortRepr):
     def search(self) -> WorstCaseSearch:
         """Searches the tasks for the largest distance of each draw."""
         settings = WorstCaseSettings.for_dimension(self.validation.space.dimension, self.planner.batched)
+        if self.share < 1:
+            return ShareSearch(self.planner, self.seed, self.share, settings)
         return WorstCaseSearch(self.planner, self.seed, settings)
 
     def search_within(self, ledger: Ledger, replicates: int) -> WorstCaseSearch:
         """Return the search, of fewer tasks if the budget of a ledger does not allow all of them."""
-        if not ledger.is_limited:
+        if not ledger.is_limited or self.share < 1:  # fewer tasks tell nothing of a share of them
             return self.search
         shares = self.settings.thinking.shares if self.search.members is None else (1.0,)
         for share in shares:
