@@ -48,8 +48,8 @@ class Remedy:
     """Executions that close a check."""
 
     tasks: tuple[Array, ...] = ()  #: tasks ``(m, d)`` in the order of preference, each the first that is new
-    #: whether the first new task is executed, the first one again, or a task that is drawn, from all or from those whose
-    #: predicted distances exceed the threshold
+    #: whether the first new task is executed, the first one again, or a task that is drawn, from all or from those
+    #: whose predicted distances exceed the threshold
     kind: Literal["new", "again", "drawn", "drawn above"] = "new"
 
 

@@ -9,8 +9,8 @@ them do, and the expected value of J is at most ``p N``, so that
 
 has an expected value of at most 1, whatever predicted the K tasks and however K comes out; :math:`\lambda` follows from
 earlier executions. An independent draw is the case K = N. The product over all such executions is a nonnegative
-supermartingale, which reaches ``1 / (1 - confidence)`` with probability at most 1 - confidence (Ville 1939). So "at most
-a share p exceeds tau" is falsified there, at any time and without any assumption on the system.
+supermartingale, which reaches ``1 / (1 - confidence)`` with probability at most 1 - confidence (Ville 1939). So the
+statement that at most a share p exceeds tau is falsified there, at any time and without assumptions on the system.
 """
 
 from __future__ import annotations

@@ -156,7 +156,8 @@ def judge(
     if verdict is None:
         try:
             certificate = _certified(trials, chosen, known, threshold)
-            verdict = judge_by(certificate, trials, threshold, volume=chosen.left_out, provenance=known, kind=chosen.kind)
+            left_out, kind = chosen.left_out, chosen.kind
+            verdict = judge_by(certificate, trials, threshold, volume=left_out, provenance=known, kind=kind)
         except CertificateError as error:
             verdict = Verdict("undecided", float(threshold), str(error))
     designs, remarks = designs_sentence(trials), list(verdict.remarks)
@@ -231,9 +232,7 @@ def assess(
     known, kind = provenance or Provenance(), options.kind
     falsified = None
     if threshold is not None:
-        falsified = counterexample(
-            trials, threshold, known.quantities, options.confidence, kind.quantile, kind.share
-        )
+        falsified = counterexample(trials, threshold, known.quantities, options.confidence, kind.quantile, kind.share)
         if falsified is None:
             verdict = judge(trials, threshold, options, known)
             if verdict.certificate is None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval.learning.closed_loops import AnyPosterior, LoopPlanner, PlannedTasks
 from ctxval.learning.draws import Draws
 from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings
@@ -99,7 +99,7 @@ class ShareSearch(WorstCaseSearch):
             top, others = self._rows(posterior, rng, self.of_share.screened_others)
             relevant = self.relevant(posterior, self.tasks[top], rng)
             draws = posterior.draw(relevant, rng, 1, self.settings.screened_draws)
-            return self._with_quantiles(of_mean, draws, top, others)
+            return self._with_quantiles(of_mean, draws, top, others, draws.left_out)
 
     def maxima(
         self, posterior: AnyPosterior, of_mean: WorstCase, known: Array, rng: np.random.Generator, functions: int
@@ -108,15 +108,15 @@ class ShareSearch(WorstCaseSearch):
         with single_threaded():
             top, others = self._rows(posterior, rng, self.of_share.others)
             draws = posterior.draw(self.relevant(posterior, self.tasks[top], rng), rng, functions)
-            return self._with_quantiles(of_mean, draws, top, others)
+            return self._with_quantiles(of_mean, draws, top, others, draws.left_out)
 
-    def _rows(self, posterior: AnyPosterior, rng: np.random.Generator, others: int) -> tuple[Array, Array]:
+    def _rows(self, posterior: AnyPosterior, rng: np.random.Generator, others: int) -> tuple[Rows, Rows]:
         """Return the rows of the tasks with the largest distances on the mean, and of some of the others."""
         order = np.argsort(-np.nan_to_num(self.of_mean(posterior), nan=-np.inf), kind="stable")
         top = self.settings.shared - self.of_share.others
         return order[:top], rng.permutation(order[top:])[:others]
 
-    def _with_quantiles(self, of_mean: WorstCase, draws: Draws, top: Array, others: Array) -> WorstCase:
+    def _with_quantiles(self, of_mean: WorstCase, draws: Draws, top: Rows, others: Rows, left_out: float) -> WorstCase:
         rows = np.concatenate([top, others])
         values = self.planner.distances(draws, self.planner.plan(self.tasks[rows]), len(rows))
         values = np.nan_to_num(values, nan=-np.inf, posinf=np.inf)
@@ -132,4 +132,4 @@ class ShareSearch(WorstCaseSearch):
             exceeding = np.arange(len(order)) + weight * further
             last = int(np.flatnonzero(exceeding <= allowed).max(initial=0))
             maxima[k], points[k] = mine[order[last]], self.tasks[top[order[last]]]
-        return of_mean.with_draws(maxima, points, values.size, draws.left_out)
+        return of_mean.with_draws(maxima, points, values.size, left_out)

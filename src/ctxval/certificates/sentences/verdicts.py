@@ -158,7 +158,8 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
     given = f"if {SMALL_ERRORS}" if details.get("negligible") else f"with {level} {condition}"
     keeps = f"every task{quantities.ranges} stays at or below {limit}{which}"
     if certificate.volume:
-        keeps = f"at least {100 * (1 - certificate.volume):.4g} % of the tasks{quantities.ranges} stay at or below {limit}"
+        share = f"{100 * (1 - certificate.volume):.4g} % {of_tasks(certificate.distribution)}"
+        keeps = f"at least {share}{quantities.ranges} stay at or below {limit}"
     return f"{untested}{keeps}: the {kind} bound is {upper}, {given}."
 
 
@@ -362,7 +363,8 @@ def undecided(certificate: Certificate, tau: float, volume: float, quantities: Q
     if certificate.upper_bound > tau:
         why = f"no distance above {limit} was executed, but d* may be up to {upper}"
         if certificate.volume:
-            why = f"{100 * certificate.volume:.4g} % of the tasks may have distances above {upper}; the threshold is {limit}"
+            share = f"{100 * certificate.volume:.4g} % {of_tasks(certificate.distribution)}"
+            why = f"{share} may have distances up to {upper} and more, and the threshold is {limit}"
         if (quantile := certificate.details.get("quantile")) is not None:
             share = f"{100 * quantile:g} % of the executions of a task"
             why = f"{share} may have distances of up to {upper}, and the threshold is {limit}"
