@@ -38,7 +38,7 @@ from ctxval.certificates.task_share import PREDICTED_ABOVE, bet_on
 from ctxval.certificates.verdict import counterexample, require_suite
 from ctxval.core.trial import Trial, Trials
 from ctxval.errors import CertificateError, InputError
-from ctxval.learning.task_share import ShareSearch
+from ctxval.learning.share_search import ShareSearch
 from ctxval.learning.worst_case import is_kinked
 
 

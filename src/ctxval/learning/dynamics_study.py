@@ -32,8 +32,8 @@ from ctxval.learning.precision import AgreeingDynamics, AgreementSettings, agree
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, schedule, scheduled
 from ctxval.learning.regular import RegularSettings, split_transitions
+from ctxval.learning.share_search import ShareSearch
 from ctxval.learning.stage_costs import Costs, Ledger, ThinkingSettings, reduced
-from ctxval.learning.task_share import ShareSearch
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
