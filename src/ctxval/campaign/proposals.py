@@ -38,7 +38,7 @@ from ctxval.searches import BaseSearch, SequentialSearch
 Note = dict[str, Any] | None
 
 _MOVED = 0x6D6F  # identifies the random stream of moves away from tasks that are not steady
-_DRAW, _HYPERCUBE, _CHOSEN = 0x6175, 0x6879, 0x6368  # independent draws, Latin hypercubes, draws to choose from
+_DRAW, _HYPERCUBE = 0x6175, 0x6879  # those of independent draws, and of Latin hypercubes
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +223,7 @@ class IndependentDraws:
     def many(self, trials: Sequence[Trial], count: int) -> Array:
         """Return independent draws from which the next task is chosen, points of the unit cube ``(count, d)``."""
         space = self._validation.space
-        return space.rounded(space.unit_draws(count, self._generator(len(trials), _CHOSEN)))
+        return space.rounded(space.unit_draws(count, self._generator(len(trials), _DRAW, count)))
 
     def hypercube(self, number: int, candidate: int = 0) -> Array:
         """Return one of the Latin hypercubes for tests of a number ``(TESTS, d)``, whatever the results are."""

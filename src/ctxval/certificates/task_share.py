@@ -28,8 +28,19 @@ Share = Annotated[float, Must("a share of the tasks from 0.5 to 1", lambda value
 
 PREDICTED_ABOVE = "predicted_above"
 """Key of K / N and of the bet in the note of a task that was drawn where distances above the threshold are expected."""
-_HOLDS = 0.9  # probability that is bet on for a task whose predicted distance exceeds the threshold
-_BOLDEST = 0.9  # largest share of the wealth that is bet
+
+
+@dataclass(frozen=True)
+class BetSettings:
+    """How much is bet; no bet ruins the wealth."""
+
+    holds: float = 0.9  #: probability that is bet on for a task whose predicted distance exceeds the threshold
+    boldest: float = 0.9  #: largest share of the wealth that is bet
+    drawn: float = 2.0  #: share of the wealth that is bet on an independent draw, as a multiple of 1 - share
+
+
+BETS = BetSettings()
+"""The settings in use."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +63,7 @@ def bet_on(predicted: float, share: float) -> float:
     It is that of the largest growth (Kelly 1956) if such a task exceeds tau with a probability of 0.9.
     """
     chance = min((1 - share) / max(predicted, 1e-12), 1.0)  # if at most a share 1 - share exceeds tau
-    return float(np.clip((_HOLDS - chance) / max(1 - chance, 1e-12), 0.0, _BOLDEST))
+    return float(np.clip((BETS.holds - chance) / max(1 - chance, 1e-12), 0.0, BETS.boldest))
 
 
 def bets_on_share(trials: Sequence[Trial], threshold: float, share: float, confidence: float) -> ShareBets:
@@ -79,4 +90,4 @@ def _bet_of(trial: Trial, threshold: float, share: float) -> tuple[float, float]
     match note.get(PREDICTED_ABOVE):
         case [float(stated), float(part), float(stake)] if stated == threshold and 0 < part <= 1 and 0 <= stake < 1:
             return stake, part
-    return (2 * (1 - share), 1.0) if trial.origin == "iid" else None
+    return (BETS.drawn * (1 - share), 1.0) if trial.origin == "iid" else None
