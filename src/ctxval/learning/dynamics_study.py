@@ -24,7 +24,7 @@ from ctxval.learning.dry_friction import DryFriction
 from ctxval.learning.dynamics_posterior import LearnedCovariances, PosteriorSettings, condition, learn_covariances
 from ctxval.learning.effects.inputs import InputEffects
 from ctxval.learning.extended import ExtendedValidation
-from ctxval.learning.input_effects import Found
+from ctxval.learning.input_effects import Found, input_candidates
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import NoiseSettings, NoiseStudy
 from ctxval.learning.parametric_dynamics import ParametricDynamics, ParametricSettings, learned_parameters
@@ -89,6 +89,7 @@ class DynamicsStudy(ShortRepr):
         self.planner = LoopPlanner(self.validation, of_inputs)
         self._errors = ErrorVectors(self.planner if validation.outputs is None else LoopPlanner(validation))
         self._covariances = Latest[bytes, LearnedCovariances | None](8)
+        self._effects_of = Latest[bytes, Found](8)
         self._made = Latest[tuple[object, ...], DynamicsStudy](8)
         self._searches: dict[float, WorstCaseSearch] = {}
         #: largest distances of tasks if M errs by so much in each step, of each error and task
@@ -212,14 +213,18 @@ class DynamicsStudy(ShortRepr):
         model = uncertain_in(before_refinement(self.validation.model))
         if model is None or not executed or self.extended.needs_tasks or self.friction is not None:
             return None
-        loops, recorded = (
-            [trajectory for _, trajectory in executed],
-            self.transitions_of(executed, (), with_data=False),
-        )
-        if recorded is None:
+        loops, on_model, settings = [trajectory for _, trajectory in executed], self.extended.loops, self.settings
+        if on_model is None:
             return None
-        seed = self.seed, len(executed), 0
-        posterior = learned_parameters(model, loops, recorded, seed, settings=self.settings.parametric)
+        candidates, count = self.input_candidates(loops, together=True), scheduled(len(loops))
+        key = digest(loops[:count])
+        posterior, seed = None, (self.seed, count, 0)
+        if key not in self._effects_of:
+            posterior = learned_parameters(model, loops[:count], on_model, seed, candidates, None, settings.parametric)
+            self._effects_of[key] = () if posterior is None else posterior.effects
+        if posterior is None or count < len(loops):
+            seed, known = (self.seed, len(loops), 0), self._effects_of[key]
+            posterior = learned_parameters(model, loops, on_model, seed, candidates, known, settings.parametric)
         if posterior is None:
             return None
         points = np.array([point for point, _ in executed])
@@ -364,6 +369,14 @@ class DynamicsStudy(ShortRepr):
         data = self._data if with_data and not self.effects else None
         loops = [loop for _, loop in executed]
         return recorded_transitions(self.validation.model, data, loops, self.extended.loops, logged)
+
+    def input_candidates(self, loops: Sequence[Trajectory], *, together: bool) -> Found:
+        """Return the effects that inputs may have in executions, alone or only those of all inputs ``together``."""
+        commands, times = np.concatenate([each.inputs for each in loops]), max((each.times for each in loops), key=len)
+        seconds = float(times[-1] - times[0])
+        dt, names = seconds / max(len(times) - 1, 1), self.input_names(commands.shape[1])
+        model = before_refinement(self.validation.model)
+        return input_candidates(model, dt, names, commands, seconds, together=together)
 
     def input_names(self, inputs: int) -> list[tuple[str, str]]:
         """Return the names and units of the m inputs."""

@@ -47,15 +47,15 @@ RecordsOf = Callable[[InputEffects], Sequence[Record]]
 
 
 def input_candidates(
-    model: Model, dt: float, inputs: Sequence[tuple[str, str]], commands: Array, seconds: float, *, estimated: bool
+    model: Model, dt: float, inputs: Sequence[tuple[str, str]], commands: Array, seconds: float, *, together: bool
 ) -> Found:
     """Return the effects that inputs may have and no smooth residual has, for commands ``(N, m)`` and their names.
 
-    If states are ``estimated``, only those of all inputs together are tried: an estimate costs too much.
+    Only those of all inputs ``together`` are returned if each costs too much.
     """
     plant = Plant(model, dt, [], list(inputs), (), (), np.empty(0), np.maximum(np.abs(commands).max(axis=0), 1e-9))
-    observed = Observed(plant, np.empty((0, 0)), commands, np.empty(0), seconds, estimated)
-    of_inputs = [kind for kind in kinds() if issubclass(kind, Late if estimated else (Late, OfInput))]
+    observed = Observed(plant, np.empty((0, 0)), commands, np.empty(0), seconds, estimated=False)
+    of_inputs = [kind for kind in kinds() if issubclass(kind, Late if together else (Late, OfInput))]
     every = [each for kind in of_inputs for each in kind.candidates(observed)]
     return tuple(each for each in every if (each.effect.remembers or each.effect.kinked) and not each.effect.in_parts)
 

@@ -21,7 +21,7 @@ from ctxval.learning.dry_friction import FrictionSettings, found_friction
 from ctxval.learning.effects.inputs import InputEffects
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
-from ctxval.learning.input_effects import Found, InputEffectSettings, found_effects, input_candidates
+from ctxval.learning.input_effects import Found, InputEffectSettings, found_effects
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.prediction import Executed
 from ctxval.learning.recorded import digest, schedule
@@ -180,13 +180,9 @@ class StructureSearch:
 
         # If states are recorded, they are the same with all effects.
         plain = [] if estimated else estimated_with(InputEffects())
-        model, commands = before_refinement(study.validation.model), np.concatenate(commanded)
-        times = max((trajectory.times for _, trajectory in among), key=len)
-        seconds = float(times[-1] - times[0])
-        candidates = input_candidates(
-            model, seconds / (len(times) - 1), study.input_names(commands.shape[1]), commands, seconds,
-            estimated=estimated,
-        )  # fmt: skip
+        model = before_refinement(study.validation.model)
+        # If states have to be estimated each time, single inputs cost too much.
+        candidates = study.input_candidates([trajectory for _, trajectory in among], together=estimated)
         with single_threaded(), np.errstate(all="ignore"):
             found = found_effects(
                 model, estimated_with if estimated else with_inputs, candidates, before,
