@@ -83,7 +83,7 @@ R = [0.1]
 type = "MaximumDeviation"
 scales = [1.0, 1.0]
 [search]
-name = "random"
+type = "random"
 """
 
 

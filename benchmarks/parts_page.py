@@ -44,7 +44,7 @@ SECTIONS = (
     ),
     Section("Sets", specs.SETS, '`avoid = [{ type = "Ball", ... }]` of `[spec]`; `specs.Ball(...)`'),
     Section(
-        "Searches", searches.REGISTRY, '`[search]` with `name = "auto"`; `--search auto`; `searches.by_name("auto")`'
+        "Searches", searches.REGISTRY, '`[search]` with `type = "auto"`; `--search auto`; `searches.by_name("auto")`'
     ),
     Section(
         "Certificates",

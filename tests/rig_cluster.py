@@ -24,7 +24,7 @@ experiment = "rig_cluster:experiment"
 budget = 12
 seed = 5
 store = "a.sqlite"
-search = {{ name = "random" }}
+search = {{ type = "random" }}
 options = {{ folder = "{marks}", seconds = 0.2 }}
 """
 

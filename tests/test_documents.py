@@ -130,7 +130,7 @@ def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
 def test_the_glossary_explains_what_replay_and_fit_say() -> None:
     runs = [run(40, seed) for seed in range(3)]
     logs = [MemoryTable(str(k), {"t": one.times, "x": one.states, "u": one.inputs}) for k, one in enumerate(runs)]
-    recordings = recordings_of(logs, LogMapping.from_table({"states": ["x"], "inputs": ["u"]}))
+    recordings = recordings_of(logs, LogMapping.from_table({"states": {"x": "x"}, "inputs": {"u": "u"}}))
     report = replay(Linear([[1, 0.05], [0, 1]], [[0], [0.05]]), recordings)
     task = PredictedTask({}, 0.5, 0.4, 0.6, 0.9)
     tasks = PredictedTasks((task,), 0.5, 0.6, (task,), 64, 0.0, 0.1, 0)

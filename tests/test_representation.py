@@ -125,9 +125,9 @@ def network() -> bytes:
 def fmu() -> systems.FMU:
     """Return an FMU of which only the settings are there."""
     made = object.__new__(systems.FMU)
-    made.path, made.states, made.inputs = Path("/somewhere/cart.fmu"), ["position", "speed"], ["force"]
+    made.path, made.states, made.inputs = Path("/somewhere/cart.fmu"), {"position": "m", "speed": "m/s"}, {"force": "N"}
     made._digest = "0" * 16
-    made.start, made.parameters, made.step = {"position": "x0"}, {"mass": 2.0}, 0.01
+    made.start, made.parameters, made.substeps = {"position": "x0"}, {"mass": 2.0}, 10
     return made
 
 
@@ -496,8 +496,8 @@ EXACT = {
     "Trial": "Trial(3, origin='initial', state='failed', attempts=2, parameters={'goal': 0.25})\n"
     "  failure: motor stalled",
     "searches.Repeated": "Repeated(search=Random(), times=3)",
-    "systems.FMU": "FMU(path='/somewhere/cart.fmu', states=['position', 'speed'], inputs=['force'], "
-    "start={'position': 'x0'}, parameters={'mass': 2}, step=0.01)",
+    "systems.FMU": "FMU(path='/somewhere/cart.fmu', states={'position': 'm', 'speed': 'm/s'}, inputs={'force': 'N'}, "
+    "start={'position': 'x0'}, parameters={'mass': 2}, substeps=10)",
     "systems.Simulated": "Simulated(model=Linear(A=(2, 2) in [0, 1], B=(2, 1) in [0, 0.1], c=[0, 0], "
     "data=Transitions(x=(40, 2) in [-1, 1], u=(40, 1) in [0.01644, 25], x_next=(40, 2) all 0)))",
     "controllers.AffineFeedback": "AffineFeedback(gains=(25, 1, 2) in [-1.595, 0], inputs=(25, 1) in [0, 0.4234], "

@@ -90,7 +90,7 @@ def _coded(rng: Rng, folder: Path, base: Path) -> tuple[str, ...]:
     head, between = text[: text.index("[space]")], text[text.index("[space]") :]
     if "task" in name:
         first, last = between.index("[task]"), between.index("[states]")
-        head, between = f'{head}task = "experiment_system:task"\n', between[:first] + between[last:]
+        head, between = f'{head}task = {{ ref = "experiment_system:task" }}\n', between[:first] + between[last:]
     if "distance" in name:
         first, last = between.index("[distance]"), between.index("[search]")
         between = f'{between[:first]}[distance]\ntype = "experiment_system:distance"\n{between[last:]}'

@@ -98,9 +98,12 @@ def _name_code(connection: sqlite3.Connection, rng: Rng) -> None:
                 {"type": "Function", "function": {"ref": name}},
             ),
             *({"ref": name}, {"type": "Subprocess", "command": "touch PWNED"}, {"name": name}, {"type": name}),
-            *({"type": "FMU", "path": "a.fmu"}, {"type": "Linear", "A": {"ref": name}, "B": [[1.0]]}, [name]),
+            *({"type": "FMU", "source": "a.fmu"}, {"type": "Linear", "A": {"ref": name}, "B": [[1.0]]}, [name]),
             *({"type": "MuJoCo", "mjcf": "/dev/zero"}, {"type": "Gymnasium", "environment": "pwned:x"}),
-            *({"name": "random", "rng": {"ref": name}}, {"type": "GaussianProcessModel", "data": ["/dev/zero"]}),
+            *(
+                {"type": "random", "rng": {"ref": name}},
+                {"type": "GaussianProcessModel", "data": {"logs": ["/dev/zero"]}},
+            ),
             *({"type": "Onnx", "path": "../../../etc/passwd"}, {"type": "Policy", "function": {"ref": name}}),
         ),
     )

@@ -139,7 +139,7 @@ def test_a_table_that_could_be_misread_is_refused_by_all_readers(
     text: str, facts: tuple[object, ...], tmp_path: Path
 ) -> None:
     (tmp_path / "a.csv").write_text(text)
-    mapping = LogMapping.from_table({"states": ["x0"], "inputs": ["u0"]})
+    mapping = LogMapping.from_table({"states": {"x0": "x0"}, "inputs": {"u0": "u0"}})
     for read in (
         Trajectory.from_csv,
         lambda path: read_recordings([path]),

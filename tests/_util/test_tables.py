@@ -20,7 +20,7 @@ from rig_dialects import DIALECTS
 T = 0.02 * np.arange(60)
 COLUMNS = {"angle": np.sin(3 * T), "speed": 3 * np.cos(3 * T), "voltage": np.sign(np.sin(9 * T)) + 0.25}
 ROWS = [["t", *COLUMNS], *([f"{value:.6f}" for value in row] for row in zip(T, *COLUMNS.values(), strict=True))]
-MAPPING = LogMapping.from_table({"states": ["angle", "speed"], "inputs": ["voltage"]})
+MAPPING = LogMapping.from_table({"states": {"angle": "angle", "speed": "speed"}, "inputs": {"voltage": "voltage"}})
 
 
 def written(path: Path, content: str | bytes) -> Path:
@@ -106,7 +106,7 @@ def test_a_cell_that_is_no_number_is_named_with_its_line(
 def test_a_time_that_does_not_exist_is_refused(times: list[str], facts: tuple[object, ...], tmp_path: Path) -> None:
     path = written(tmp_path / "run.csv", "time,x\n" + "".join(f"{time},{k}\n" for k, time in enumerate(times)))
     with pytest.raises(InputError) as caught:
-        read_recordings([path], LogMapping.from_table({"states": ["x"]}))
+        read_recordings([path], LogMapping.from_table({"states": {"x": "x"}}))
     assert_names(str(caught.value), *facts)
 
 

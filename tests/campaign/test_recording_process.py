@@ -27,7 +27,7 @@ FIELDS = {
     "run.csv": None,
     "run.npz": None,
     "run.mat": {"states": {"s": "log.state"}, "inputs": {"force": "force"}, "time": "log.time"},
-    "run.parquet": {"states": ["position", "speed"], "inputs": ["force"]},
+    "run.parquet": {"states": {"position": "position", "speed": "speed"}, "inputs": {"force": "force"}},
     "run.mcap": {
         "states": {"position": "/state.cart.position", "speed": "/state.cart.speed[0]"},
         "inputs": {"force": "/command.force"},

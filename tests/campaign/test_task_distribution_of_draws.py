@@ -94,7 +94,7 @@ def test_every_text_says_that_a_volume_is_a_probability_under_it(kind: Certifica
 FILE = """
 experiment = "pendulum"
 [search]
-name = "random"
+type = "random"
 [distribution]
 goal = { type = "normal", mean = 0.5, deviation = 0.1 }
 """

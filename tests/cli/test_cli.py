@@ -159,7 +159,7 @@ def test_the_random_baselines_run(invoke, search: str) -> None:  # type: ignore[
 def test_an_experiment_file_runs_and_the_command_line_wins(invoke) -> None:  # type: ignore[no-untyped-def]
     Path("e.toml").write_text(
         'experiment = "rig:experiment"\nbudget = 9\nseed = 2\nstore = "x.sqlite"\n'
-        '[options]\nhorizon = 20\n[search]\nname = "gp-ucb"\nbeta = 3.0\n'
+        '[options]\nhorizon = 20\n[search]\ntype = "gp-ucb"\nbeta = 3.0\n'
     )
     report = json.loads(invoke("run", "e.toml", "--budget", "6", "--json").stdout)
     assert (report["executions"], report["seed"], report["store"]) == (6, 2, "x.sqlite")
@@ -246,7 +246,7 @@ def test_an_example_is_written_to_a_new_folder(invoke) -> None:  # type: ignore[
         ("not toml at all", ()),
         ('experiment = "pendulum"\noptions = 3', ()),
         ('experiment = "pendulum"\nsearch = 3', ("search",)),
-        ('experiment = "pendulum"\n[search]\nname = "gp-ucb"\nbetta = 1', ("betta",)),
+        ('experiment = "pendulum"\n[search]\ntype = "gp-ucb"\nbetta = 1', ("betta",)),
     ],
 )
 def test_bad_experiment_files_are_named_with_what_is_wrong(invoke, toml: str, facts: tuple[object, ...]) -> None:  # type: ignore[no-untyped-def]
@@ -585,7 +585,7 @@ def test_status_and_cases_speak_to_people_and_to_programs(invoke) -> None:  # ty
 
 @pytest.mark.slow
 def test_a_store_is_certified_against_the_threshold_of_its_file(invoke) -> None:  # type: ignore[no-untyped-def]
-    settings = 'budget = 5\nthreshold = 0.01\nexplore = true\nsearch = { name = "gp-ucb" }'
+    settings = 'budget = 5\nthreshold = 0.01\nexplore = true\nsearch = { type = "gp-ucb" }'
     Path("e.toml").write_text(f'experiment = "rig:experiment"\nstore = "e.sqlite"\n{settings}')
     assert invoke("run", "e.toml").exit_code == 1
     result = invoke("certify", "e.sqlite", "--json")

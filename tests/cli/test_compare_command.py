@@ -42,7 +42,7 @@ type = "WholeTrajectory"
 norm = inf
 components = [0]
 [search]
-name = "gp-ucb"
+type = "gp-ucb"
 [synthesizer]
 type = "LQR"
 """

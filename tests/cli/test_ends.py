@@ -65,7 +65,7 @@ def test_a_task_function_that_ends_the_process_does_not_end_it(folder: Path, cod
     text = toml.read_text()
     (stem,) = (path.stem for path in folder.glob("system_*.py"))
     head, tail = text[: text.index("[task]")], text[text.index("[states]") :]
-    toml.write_text(f'task = "{stem}:task"\n{head}{tail}')
+    toml.write_text(f'task = {{ ref = "{stem}:task" }}\n{head}{tail}')
     result = invoke(*RUN)
     assert (result.exit_code, f"{stem}.py" in result.stderr) == (3, True)
 

@@ -73,7 +73,7 @@ def test_a_network_is_written_as_onnx_with_its_data_beside_it(invoke: Invoke) ->
     pytest.importorskip("onnxruntime")
     found = report(invoke("logs", "--kind", "network", "--out", "model.onnx", "--json"))
     assert found["files"] == ["model.onnx", "model.data.npz"]
-    model = part("model", {"type": "Onnx", "source": "model.onnx", "data": "model.data.npz"}, Path())
+    model = part("model", {"type": "Onnx", "source": "model.onnx", "data": {"logs": ["model.data.npz"]}}, Path())
     assert len(model.data) == 240
     one = run(80, 0)
     np.testing.assert_allclose(model.step(one.states[:-1], one.inputs), one.states[1:], atol=0.05)
@@ -98,7 +98,7 @@ def test_fields_are_named_as_for_replay(invoke: Invoke) -> None:
     files = ("0.mcap", "1.mcap", "2.mcap")
     found = report(invoke(*files, *fields, "--kind", "linear", "--dt", "0.05", "--delay", "0", "--json"))
     assert {one["state"] for one in found["fitted"][0]["errors"]} == {"p", "v"}
-    Path("map.toml").write_text('states = ["/state.cart.position"]\ninputs = ["/command.force"]\n')
+    Path("map.toml").write_text('[states]\nposition = "/state.cart.position"\n[inputs]\nforce = "/command.force"\n')
     result = invoke(*files, "--mapping", "map.toml", "--kind", "linear", "--json")
     assert result.exit_code == 1  # without the speed, the position cannot be predicted
     mapped = json.loads(result.stdout)
@@ -188,7 +188,7 @@ def test_a_model_file_holds_its_time_step(invoke: Invoke, name: str) -> None:
     assert invoke("logs", *kind, "--out", name).exit_code == 0
     source = {
         "model.npz": 'type = "Saved"\nsource = "model.npz"',
-        "model.onnx": 'type = "Onnx"\nsource = "model.onnx"\ndata = "model.data.npz"',
+        "model.onnx": 'type = "Onnx"\nsource = "model.onnx"\ndata = { logs = ["model.data.npz"] }',
         "model.toml": Path(name).read_text().partition("[model]\n")[2] if name.endswith("toml") else "",
     }[name]
     for dt, agrees in ((DT, True), (2 * DT, False)):
@@ -231,12 +231,12 @@ def test_recorded_data_of_several_files_have_one_unit_and_one_time_step(invoke: 
     run(80, 5, dt=2 * DT).to_csv("slow.csv")
     np.savez("slow.npz", **{name: getattr(run(80, 5, dt=2 * DT), name) for name in ("times", "states", "inputs")})
     run(80, 6).to_csv("degrees.csv", states=["x0 [deg]", "x1"])
-    table = {"type": "Linear", "data": ["logs/0.csv", "logs/1.csv"]}
+    table = {"type": "Linear", "data": {"logs": ["logs/0.csv", "logs/1.csv"]}}
     assert len(part("model", table).data) == 160
-    assert len(part("model", {**table, "data": ["logs/0.csv", "slow.csv"]}).data) == 80 + 160
+    assert len(part("model", {**table, "data": {"logs": ["logs/0.csv", "slow.csv"]}}).data) == 80 + 160
     for other, facts in (
         ("slow.npz", (0.05, 0.1)),
         ("degrees.csv", ("degrees.csv",)),
     ):
         with refuses(InputError, *facts):
-            part("model", {**table, "data": ["logs/0.csv", other]})
+            part("model", {**table, "data": {"logs": ["logs/0.csv", other]}})

@@ -69,7 +69,7 @@ R = [0.1]
 type = "MaximumDeviation"
 components = [0]
 [search]
-name = "auto"
+type = "auto"
 thinking = "fast"
 """
 

@@ -49,8 +49,8 @@ type = "MaximumDeviation"
 components = [0]
 [recordings]
 dt = {DT}
-states = ["x0", "x1"]
-inputs = ["u0"]
+states = {{ x0 = "x0", x1 = "x1" }}
+inputs = {{ u0 = "u0" }}
 """
 
 

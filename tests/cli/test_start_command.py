@@ -132,7 +132,7 @@ def test_an_observer_is_loaded_from_the_folder_of_its_mapping(logs: Path, tmp_pa
     (tmp_path / "apart").mkdir()
     (tmp_path / "apart" / "an_observer.py").write_text(OBSERVER)
     mapping = tmp_path / "apart" / "mapping.toml"
-    observer = '[observer]\nfunction = "an_observer:estimate"\nstates = { twice = "m", rate = "m/s" }\n'
+    observer = '[observer]\nfunction = { ref = "an_observer:estimate" }\nstates = { twice = "m", rate = "m/s" }\n'
     mapping.write_text(f'[states]\nposition = "position"\n[inputs]\nforce = "force"\n{observer}')
     call = calling()
     found = report(call("fit", str(logs), "--mapping", str(mapping), "--json"))

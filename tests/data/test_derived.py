@@ -25,7 +25,7 @@ def read(columns: dict[str, Any], **mapping: Any) -> Recordings:
 def test_the_derivative_of_a_parabola_is_exact(of: tuple[float, float, float], window: int) -> None:
     a, b, c = of
     states = {"rate": {"derivative_of": "angle", "window": window}, "angle": {"path": "q", "unit": "rad"}}
-    recordings = read({"q": a + b * T + c * T**2, "u": T}, states=states, inputs=["u"])
+    recordings = read({"q": a + b * T + c * T**2, "u": T}, states=states, inputs={"u": "u"})
     (run,) = recordings.runs
     assert list(recordings.states.items()) == [("rate", "rad/s"), ("angle", "rad")]
     assert np.allclose(run.trajectory.states[:, 0], b + 2 * c * T, atol=1e-9)
@@ -33,7 +33,7 @@ def test_the_derivative_of_a_parabola_is_exact(of: tuple[float, float, float], w
 
 
 def test_earlier_records_are_states() -> None:
-    recordings = read({"y": np.sin(T), "u": np.cos(T)}, states=["y"], inputs=["u"], lags=2)
+    recordings = read({"y": np.sin(T), "u": np.cos(T)}, states={"y": "y"}, inputs={"u": "u"}, lags=2)
     (run,) = recordings.runs
     names = ["y", "y a step before", "y 2 steps before", "u a step before", "u 2 steps before"]
     assert list(recordings.states) == names
@@ -55,7 +55,7 @@ def test_a_state_that_is_not_recorded_is_made_good_by_the_past() -> None:
         logs.append(MemoryTable("run", {"t": T, "y": x[:, 0], "u": u}))
 
     def error(lags: int) -> float:
-        mapping = LogMapping.from_table({"states": ["y"], "inputs": ["u"], "lags": lags})
+        mapping = LogMapping.from_table({"states": {"y": "y"}, "inputs": {"u": "u"}, "lags": lags})
         return fit(recordings_of(logs, mapping), ["linear"]).fitted[0].errors[0].relative
 
     assert error(0) > 0.1
@@ -65,11 +65,11 @@ def test_a_state_that_is_not_recorded_is_made_good_by_the_past() -> None:
 def test_recordings_that_are_too_short_are_left_out_and_said() -> None:
     y = np.sin(T)
     y[[3, 25]] = np.nan
-    recordings = read({"y": y, "u": T}, states={"y": "y", "v": {"derivative_of": "y", "window": 5}}, inputs=["u"])
+    recordings = read({"y": y, "u": T}, states={"y": "y", "v": {"derivative_of": "y", "window": 5}}, inputs={"u": "u"})
     assert len(recordings.runs) == 2
     assert_names(str(recordings.breaks[-1]), 5)
     with refuses(InputError, 41):
-        read({"y": T, "u": T}, states={"y": "y", "v": {"derivative_of": "y", "window": 41}}, inputs=["u"])
+        read({"y": T, "u": T}, states={"y": "y", "v": {"derivative_of": "y", "window": 41}}, inputs={"u": "u"})
 
 
 @pytest.mark.parametrize(
@@ -79,9 +79,9 @@ def test_recordings_that_are_too_short_are_left_out_and_said() -> None:
         ({"states": {"y": "y", "v": {"derivative_of": "z"}}}, ("v", "z")),
         ({"states": {"y": "y", "v": {"derivative_of": "y", "path": "u"}}}, ("v", "y")),
         ({"states": {"y": "y", "v": {"derivative_of": "y", "window": 4}}}, ("window", "v")),
-        ({"states": ["y"], "inputs": {"v": {"derivative_of": "y"}}}, ("v",)),
-        ({"states": ["y"], "lags": -1}, ("lags", 0)),
-        ({"states": ["y"], "lags": 1.5}, ("lags", 0)),
+        ({"states": {"y": "y"}, "inputs": {"v": {"derivative_of": "y"}}}, ("v",)),
+        ({"states": {"y": "y"}, "lags": -1}, ("lags", 0)),
+        ({"states": {"y": "y"}, "lags": 1.5}, ("lags", 0)),
     ],
 )
 def test_what_cannot_be_derived_is_refused(mapping: dict[str, Any], facts: tuple[object, ...]) -> None:

@@ -118,7 +118,7 @@ def test_a_chunk_that_is_much_larger_than_its_file_is_not_decompressed(
     if lies:  # what the file declares is less than what is in it
         path.write_bytes(content.replace(size.to_bytes(8, "little"), (1000).to_bytes(8, "little")))
     with refuses(InputError, "a.mcap", most):
-        read_recordings([path], LogMapping.from_table({"states": ["/a.x"]}))
+        read_recordings([path], LogMapping.from_table({"states": {"/a.x": "/a.x"}}))
 
 
 def test_messages_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,7 +127,9 @@ def test_messages_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(TopicLog, "limits", MessageLimits(numbers=10_000))
     write_mcap_json(tmp_path / "a.mcap", run(60))
     with refuses(InputError, "a.mcap", 10000):
-        read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": ["/state.cart.position"]}))
+        read_recordings(
+            [tmp_path / "a.mcap"], LogMapping.from_table({"states": {"/state.cart.position": "/state.cart.position"}})
+        )
 
 
 def test_messages_out_of_order_are_read_in_the_order_of_their_log_times(tmp_path: Path) -> None:
@@ -140,7 +142,7 @@ def test_messages_out_of_order_are_read_in_the_order_of_their_log_times(tmp_path
         for k in (3, 0, 2, 1, 4):
             writer.add_message(topic, log_time=k * 10**8, publish_time=0, data=b'{"x": %d}' % k)
         writer.finish()
-    found = read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": ["/a.x"]}))
+    found = read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": {"/a.x": "/a.x"}}))
     assert found.runs[0].trajectory.states[:, 0].tolist() == [0, 1, 2, 3, 4]
 
 
@@ -156,7 +158,7 @@ def test_a_compressed_bag_that_is_much_larger_than_it_looks_is_refused(
 
     monkeypatch.setattr("rosbags.rosbag1.Writer", Compressing)
     write_bag1(tmp_path / "a.bag", run(60))
-    mapping = LogMapping.from_table({"states": ["/joints.position[0]"]})
+    mapping = LogMapping.from_table({"states": {"/joints.position[0]": "/joints.position[0]"}})
     assert read_recordings([tmp_path / "a.bag"], mapping).steps == 60
     monkeypatch.setattr(TopicLog, "limits", MessageLimits(chunk=1000))
     with refuses(InputError, 1000, "a.bag"):
@@ -173,5 +175,5 @@ def test_the_definition_of_a_message_is_not_printed(tmp_path: Path, capfd: pytes
         writer.add_message(writer.register_channel("/a", "cdr", schema), log_time=0, publish_time=0, data=b"")
         writer.finish()
     with refuses(InputError, "a.mcap", 0):
-        read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": ["/a.x"]}))
+        read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": {"/a.x": "/a.x"}}))
     assert capfd.readouterr() == ("", "")

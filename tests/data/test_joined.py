@@ -102,7 +102,7 @@ def test_a_field_of_several_topics_is_named_with_its_topic(tmp_path: Path) -> No
     (run,) = read_recordings([tmp_path], LogMapping.from_table({"states": {"v": {"path": "right.speed"}}})).runs
     np.testing.assert_allclose(run.trajectory.states[:, 0], -run.trajectory.times, atol=1e-6)
     with refuses(InputError, "speed"):
-        read_recordings([tmp_path], LogMapping.from_table({"states": ["speed"]}))
+        read_recordings([tmp_path], LogMapping.from_table({"states": {"speed": "speed"}}))
 
 
 def test_recordings_with_a_field_in_common_are_not_joined(tmp_path: Path) -> None:
@@ -131,7 +131,9 @@ def test_matrices_of_a_to_file_block_and_structures_with_time_are_read(times: np
     ):
         (log,) = read_logs([tmp_path / f"{name}.mat"])
         assert log.fields() == fields
-        mapping = LogMapping.from_table({"states": [fields[2]], "time": fields[0], "dt": 0.004, "longest_gap": 1.0})
+        mapping = LogMapping.from_table(
+            {"states": {"rate": fields[2]}, "time": fields[0], "dt": 0.004, "longest_gap": 1.0}
+        )
         run = read_recordings([tmp_path / f"{name}.mat"], mapping).runs[0]
         column = int(fields[2][-1]) - (name == "a")
         expected = np.interp(run.start + run.trajectory.times, times, RATES[:, column])

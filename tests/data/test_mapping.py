@@ -26,7 +26,7 @@ angle = { path = "/joint.position[0]", unit = "rad", recorded = "deg", angle = t
 rate = "/joint.velocity[0]"
 
 [recordings.inputs]
-torque = { field = "/command.effort", factor = 2.0, held = true }
+torque = { path = "/command.effort", factor = 2.0, held = true }
 """
 
 
@@ -56,8 +56,11 @@ def test_a_mapping_in_toml_is_that_in_python(tmp_path: Path) -> None:
         ({"states": {}}, ("log",)),
         ({"observer": 3}, ("observer", 3)),
         ({"observer": {"functon": "a:b"}}, ("observer", "function")),
-        ({"observer": {"function": "a:b", "state": {}}}, ("observer", "state")),
-        ({"observer": {"function": "a:b", "states": {"x": 3}}}, ("states", "x")),
+        ({"observer": "a:b"}, ("observer", "ref", "a:b")),
+        ({"states": ["x"]}, ("states", ["x"])),
+        ({"states": {"x": {"field": "y"}}}, ("x", "field", "path")),
+        ({"observer": {"function": {"ref": "a:b"}, "state": {}}}, ("observer", "state")),
+        ({"observer": {"function": {"ref": "a:b"}, "states": {"x": 3}}}, ("states", "x")),
         ({"dt": 0}, ("dt", 0)),
         ({"dt": True}, ("dt", "True")),
         ({"longest_gap": -1}, ("longest_gap", -1)),
@@ -85,9 +88,9 @@ def test_an_unusable_mapping_is_refused(change: dict[str, Any], facts: tuple[obj
 
 def test_a_mapping_needs_states() -> None:
     with refuses(InputError, "recordings"):
-        LogMapping.from_table({"inputs": ["u"]})
+        LogMapping.from_table({"inputs": {"u": "u"}})
     with pytest.raises(UnknownNameError):
-        LogMapping.from_table({"state": ["x"]})
+        LogMapping.from_table({"state": {"x": "x"}})
 
 
 @pytest.mark.parametrize(("content", "fact"), [("a = [", "a.toml"), (None, "a.toml")])

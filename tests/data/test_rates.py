@@ -34,7 +34,11 @@ RNG = np.random.default_rng(1)
 
 
 def read(columns: dict[str, Array], states: Any = ("angle", "rate"), **options: Any) -> Recordings:
-    mapping = {"states": list(states) if isinstance(states, tuple) else states, "inputs": ["voltage"], **options}
+    mapping = {
+        "states": {name: name for name in states} if isinstance(states, tuple) else states,
+        "inputs": {"voltage": "voltage"},
+        **options,
+    }
     return recordings_of([MemoryTable("log", columns)], LogMapping.from_table(mapping))
 
 

@@ -130,8 +130,8 @@ def test_a_model_that_goes_on_is_falsified_by_a_recording_that_was_stopped() -> 
 
 
 FILE = """
-task = "recorded"
-synthesizer = "recorded"
+task = { type = "recorded" }
+synthesizer = { type = "recorded" }
 model = { type = "Linear", A = [[1.0, 0.1], [0.0, 1.0]], B = [[0.0], [0.1]] }
 distance = { type = "MaximumDeviation" }
 

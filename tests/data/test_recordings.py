@@ -40,7 +40,7 @@ JOINTS = LogMapping.from_table(
         "inputs": {"force": "/joints.effort"},
     }
 )
-TABLE = LogMapping.from_table({"states": ["position", "speed"], "inputs": ["force"]})
+TABLE = LogMapping.from_table({"states": {"position": "position", "speed": "speed"}, "inputs": {"force": "force"}})
 MATLAB = LogMapping.from_table({"states": {"s": "log.state"}, "inputs": {"force": "force"}, "time": "log.time"})
 
 
@@ -162,7 +162,7 @@ def test_states_and_inputs_of_different_batches_are_refused(tmp_path: Path, shap
 def test_a_log_without_times_has_one_row_for_each_step(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("x0,u0\n1,5\n2,6\n4,7\n")
     found = read_recordings(
-        [tmp_path / "a.csv"], LogMapping.from_table({"states": ["x0"], "inputs": ["u0"], "dt": 0.1})
+        [tmp_path / "a.csv"], LogMapping.from_table({"states": {"x0": "x0"}, "inputs": {"u0": "u0"}, "dt": 0.1})
     )
     np.testing.assert_allclose(found.runs[0].trajectory.times, [0, 0.1, 0.2])
     assert found.runs[0].trajectory.inputs.tolist() == [[5], [6]]
@@ -224,11 +224,11 @@ def test_fields_of_messages_are_named_if_one_is_missing_or_is_no_number(tmp_path
     write_mcap_json(tmp_path / "a.mcap", run(4))
     path = [tmp_path / "a.mcap"]
     with refuses(InputError, "/speed", "state.cart.position", "state.cart.speed[0]"):
-        read_recordings(path, LogMapping.from_table({"states": ["/speed"]}))
+        read_recordings(path, LogMapping.from_table({"states": {"/speed": "/speed"}}))
     with refuses(InputError, 0, "cart.angle"):
-        read_recordings(path, LogMapping.from_table({"states": ["/state.cart.angle"]}))
+        read_recordings(path, LogMapping.from_table({"states": {"/state.cart.angle": "/state.cart.angle"}}))
     with refuses(InputError, 0, "cart"):
-        read_recordings(path, LogMapping.from_table({"states": ["/state.name"]}))
+        read_recordings(path, LogMapping.from_table({"states": {"/state.name": "/state.name"}}))
 
 
 def test_a_message_in_another_encoding_is_named(tmp_path: Path) -> None:
@@ -242,13 +242,15 @@ def test_a_message_in_another_encoding_is_named(tmp_path: Path) -> None:
         writer.add_message(topic, log_time=0, publish_time=0, data=b"")
         writer.finish()
     with refuses(InputError, "flatbuffer", "a.mcap"):
-        read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": ["/state.x"]}))
+        read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": {"/state.x": "/state.x"}}))
 
 
 def test_components_that_a_vector_lacks_are_named(tmp_path: Path) -> None:
     write_lerobot(tmp_path / "set", [run(5)])
     with refuses(InputError, 2, "observation.state[2]"):
-        read_recordings([tmp_path / "set"], LogMapping.from_table({"states": ["observation.state[2]"]}))
+        read_recordings(
+            [tmp_path / "set"], LogMapping.from_table({"states": {"observation.state[2]": "observation.state[2]"}})
+        )
 
 
 @pytest.mark.parametrize("content", ["{}", '{"fps": 0}', '{"fps": "fast"}', "[1]", "no json"])
@@ -320,14 +322,14 @@ def test_the_stamps_in_messages_of_ros_1_are_times_too(tmp_path: Path) -> None:
     one = run(4)
     write_bag1(tmp_path / "b.bag", one)
     (log,) = read_logs([tmp_path / "b.bag"])
-    clock = LogMapping.from_table({"states": ["x"], "stamp": "header"}).clock
+    clock = LogMapping.from_table({"states": {"x": "x"}, "stamp": "header"}).clock
     times = log.signals(["/joints.effort"], clock)["/joints.effort"].times
     np.testing.assert_allclose(times, one.times, atol=1e-9)
 
 
 def test_the_fields_of_ros_1_are_listed_if_one_is_missing(tmp_path: Path) -> None:
     write_bag1(tmp_path / "b.bag", run(4))
-    wrong = LogMapping.from_table({"states": ["/joint.angle"]})
+    wrong = LogMapping.from_table({"states": {"/joint.angle": "/joint.angle"}})
     with refuses(InputError, "joints.header.stamp.sec", "joints.position[0]", "joints.velocity"):
         read_recordings([tmp_path / "b.bag"], wrong)
 
@@ -442,5 +444,7 @@ def test_header_stamps_are_the_times_if_they_are_plausible(tmp_path: Path) -> No
 
 def test_one_clock_is_used_for_all_topics(tmp_path: Path) -> None:
     write_mcap_json(tmp_path / "a.mcap", run(10))  # without stamps
-    found = read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": ["/state.cart.position"]}))
+    found = read_recordings(
+        [tmp_path / "a.mcap"], LogMapping.from_table({"states": {"/state.cart.position": "/state.cart.position"}})
+    )
     assert not any("stamps" in note for note in found.notes)

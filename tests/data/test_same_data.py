@@ -206,7 +206,9 @@ def written(folder: Path, worn: Clothes) -> tuple[Path, LogMapping | None, bool]
     arrays = dict(columns)
     if worn.form == "npz":
         np.savez(folder / "run.npz", **arrays)
-        mapping = mapping or LogMapping.from_table({"states": ["angle", "rate"], "inputs": ["torque"]})
+        mapping = mapping or LogMapping.from_table(
+            {"states": {"angle": "angle", "rate": "rate"}, "inputs": {"torque": "torque"}}
+        )
         return folder / "run.npz", mapping, False
     if worn.form == "mat5":
         from scipy.io import savemat

@@ -17,7 +17,7 @@ from rig_logs import run, write_mcap_json
 
 def recorded(columns: dict[str, object], **options: object) -> Recordings:
     log = MemoryTable("log", {name: np.asarray(column, dtype=np.float64) for name, column in columns.items()})
-    return recordings_of([log], LogMapping.from_table({"states": ["x"], "inputs": ["u"], **options}))
+    return recordings_of([log], LogMapping.from_table({"states": {"x": "x"}, "inputs": {"u": "u"}, **options}))
 
 
 def test_states_are_interpolated_and_inputs_are_averaged_over_each_step() -> None:
@@ -84,7 +84,9 @@ def test_a_gap_between_samples_splits_the_recording_and_is_stated() -> None:
 
 def test_lost_messages_split_a_recording(tmp_path: Path) -> None:
     write_mcap_json(tmp_path / "a.mcap", run(), lost=(20, 21, 40))
-    mapping = LogMapping.from_table({"states": ["/state.cart.position"], "inputs": ["/command.force"]})
+    mapping = LogMapping.from_table(
+        {"states": {"/state.cart.position": "/state.cart.position"}, "inputs": {"/command.force": "/command.force"}}
+    )
     found = read_recordings([tmp_path / "a.mcap"], mapping)
     assert [one.trajectory.horizon for one in found.runs] == [19, 17, 19]
     assert_names([one.reason for one in found.breaks], 0.15, 0.1)
@@ -172,7 +174,7 @@ def test_inputs_that_change_between_samples_are_averaged() -> None:
             rate[k + 1] = decay * rate[k] + (1 - decay) / 0.5 * u[k]
         logs.append(MemoryTable(f"run {number}", {"t": times, "x": rate, "u": u}))
     exact = models.Linear([[np.exp(-0.5 * dt)]], [[(1 - np.exp(-0.5 * dt)) / 0.5]])
-    found = recordings_of(logs, LogMapping.from_table({"states": ["x"], "inputs": ["u"], "dt": dt}))
+    found = recordings_of(logs, LogMapping.from_table({"states": {"x": "x"}, "inputs": {"u": "u"}, "dt": dt}))
     report = replay(exact, found, steps=[1])
     assert report.errors[0].relative < 0.06  # 0.76 with the inputs at the start of each step
 
@@ -214,7 +216,7 @@ def test_one_file_in_another_unit_is_converted_or_refused(tmp_path: Path) -> Non
             paths[-1].write_text("\n".join([f"t,{header},u", *rows]))
         return paths
 
-    mapping = LogMapping.from_table({"states": ["angle"], "inputs": ["u"]})
+    mapping = LogMapping.from_table({"states": {"angle": "angle"}, "inputs": {"u": "u"}})
     found = read_recordings(written("angle [rad]", "angle [rad]", "angle [deg]", "angle_rad"), mapping)
     assert found.states == {"angle": "rad"}
     for number, one in enumerate(found.runs):

@@ -78,5 +78,5 @@ def hostile_store(path: Path) -> Store:
     last = Trial(4, "manual", "open", np.array([0.9, 0.5]), {HOSTILE: 0.9, "plain": 0.5})
     store.add([(last, model, None)])
     store.close_trials([(replace(last, state="failed", executed=True, failure=HOSTILE), None)])
-    store.keep_settings({"experiment": HOSTILE, "search": {"name": HOSTILE}, "options": {HOSTILE: HOSTILE}, "seed": 0})
+    store.keep_settings({"experiment": HOSTILE, "search": {"type": HOSTILE}, "options": {HOSTILE: HOSTILE}, "seed": 0})
     return store

@@ -45,7 +45,7 @@ def test_states_and_inputs_become_a_trajectory() -> None:
     np.testing.assert_array_equal(trajectory.times, TASK.times)
 
 
-@pytest.mark.parametrize("system", [systems.Function(run), systems.Function(run_batch, batched=True)])
+@pytest.mark.parametrize("system", [systems.Function(run), systems.Function(run_batch, vectorized=True)])
 def test_it_keeps_the_contract_of_a_system(system: systems.Function) -> None:
     testing.check_system(system, feedback, TASK)
 

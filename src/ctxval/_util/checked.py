@@ -134,7 +134,9 @@ def _missed(annotation: Any, value: Any) -> str:
 def _missed_class(cls: type, arguments: tuple[Any, ...], value: Any) -> str:
     if issubclass(cls, Mapping):
         if not isinstance(value, Mapping):
-            return "a table of names and values"
+            first = value[0] if isinstance(value, list | tuple) and value else ""
+            name = first if isinstance(first, str) and first.isidentifier() else "name"
+            return f"a table of names and values, such as {{ {name} = ... }}"
         of_items = ((key, _missed(arguments[1], item)) for key, item in value.items()) if arguments else ()
         return next((f"a table of which each value is {be}, also {key!r}" for key, be in of_items if be), "")
     if cls in (list, tuple) or cls.__name__ == "Sequence":

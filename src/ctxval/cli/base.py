@@ -28,7 +28,7 @@ from ctxval._util.progress import progress_shown
 from ctxval._util.refusals import reworded
 from ctxval._util.representation import counted
 from ctxval._util.texts import as_text, reason_of, shortened
-from ctxval.cli.commands import TEXTS, Screen, app, line, number_parser
+from ctxval.cli.commands import TEXTS, PlainCommand, Screen, app, line, number_parser
 from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
 
 if TYPE_CHECKING:  # commands that need none of them start earlier
@@ -80,7 +80,7 @@ def command(name: str | None = None, /, *, with_json: bool = True, **words: Any)
         parameters.sort(key=lambda each: leading.get(each.name, len(leading)))
         signature = inspect.Signature([_described(each, title, words) for each in parameters])
         vars(wrapped)["__signature__"] = signature
-        app.command(title)(wrapped)
+        app.command(title, cls=PlainCommand)(wrapped)
         return function
 
     return register

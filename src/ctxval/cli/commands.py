@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import importlib
+import inspect
 import tomllib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -52,6 +54,31 @@ MODULES = {name: f"ctxval.cli.{module}" for names in PANELS.values() for name, (
 """The module of each command."""
 
 
+def _plainly(options: list[Any], callback: Any) -> list[Any]:
+    """Make options read paths and texts without pydantic, which typer would load: longer than `ctxval status` takes."""
+    parameters = inspect.signature(callback).parameters
+
+    def read(option: Any, kinds: tuple[Any, ...], ctx: Any, value: Any) -> Any:
+        if isinstance(value, str) and (str in kinds or Path in kinds):
+            return value if str in kinds else Path(value)
+        if option.required or value not in (None, True, False):
+            return type(option).process_value(option, ctx, value)
+        return option.callback(ctx, option, value) if option.callback else value
+
+    for option in options:
+        annotation = parameters[option.name].annotation if option.name in parameters else None
+        kind, *_ = get_args(annotation) or (annotation,)
+        option.process_value = functools.partial(read, option, get_args(kind) or (kind,))
+    return options
+
+
+class PlainCommand(TyperCommand):
+    """A command that reads its options fast."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        return _plainly(super().get_params(ctx), self.callback)
+
+
 class Commands(TyperGroup):
     """The commands, in groups; error messages about arguments are printed with control characters escaped."""
 
@@ -64,6 +91,9 @@ class Commands(TyperGroup):
                 command.help = "\n\n".join(paragraphs)
                 vars(command).update(rich_help_panel=panel, hidden=name in TEXTS["hidden"])
                 self.commands[name] = command
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        return _plainly(super().get_params(ctx), self.callback)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args[0] in MODULES:

@@ -228,7 +228,7 @@ def mapping_content(mapping: LogMapping, dt: float) -> dict[str, Any]:
     for kind in ("states", "inputs"):
         content[kind] = {name: content_of(field) for name, field in getattr(mapping, kind).items()}
     if isinstance(mapping.observer, Observer):
-        content["observer"] = {"function": mapping.observer.reference, "states": dict(mapping.observer.states)}
+        content["observer"] = {"function": {"ref": mapping.observer.reference}, "states": dict(mapping.observer.states)}
     return content
 
 

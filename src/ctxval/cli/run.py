@@ -102,7 +102,7 @@ def run(
         if verdict is None and not settings.explores:
             with suppress(CertificateError):
                 bound = campaign.certify(certificate=certificate)
-        report: dict[str, Any] = {"case": experiment.name, "search": settings.search.name, "seed": settings.seed}
+        report: dict[str, Any] = {"case": experiment.name, "search": settings.search.type, "seed": settings.seed}
         report |= {"budget": total, "units": experiment.units, **_summary(campaign, verdict, bound, known)}
         report |= {"store": str(path), "other_stores": [str(other.path) for other in other_stores(path)]}
         report |= {"options": settings.options} if settings.options else {}

@@ -163,33 +163,24 @@ class LogMapping(ShortRepr):
     def from_table(table: Mapping[str, Any]) -> LogMapping:
         """Return the mapping that a table of TOML describes, with the attributes of this class as its keys.
 
-        A field is a path, or a table with the attributes of :class:`Field`. ``states`` and ``inputs`` may also be lists
-        of paths.
+        ``states`` and ``inputs`` are tables of fields by name; a field is a path, or a table with the attributes of
+        :class:`Field`. An observer is a table with ``function = { ref = "module:attr" }`` and its ``states``.
         """
         require_known("entry of the mapping of recordings", table, [field.name for field in fields(LogMapping)])
-        parts = dict[str, Any]()
-        for kind in ("states", "inputs"):
-            match table.get(kind, {}):
-                case {} as named:
-                    parts[kind] = named
-                case str(path):
-                    parts[kind] = {path: path}
-                case [*listed]:
-                    paths = [item.get("path") if isinstance(item, Mapping) else item for item in listed]
-                    parts[kind] = dict(zip(map(str, paths), listed, strict=True))
-                case named:
-                    raise InputError(f"{kind} must be a table of fields or a list of paths, got {named!r}.")
         if "states" not in table:
             raise InputError("the mapping of recordings needs states.")
+        for kind in ("states", "inputs"):
+            if not isinstance(given := table.get(kind, {}), Mapping):
+                example = 'angle = "column"'
+                raise InputError(f"{kind} must be a table of fields by name, such as {{ {example} }}, got {given!r}.")
         match table:
-            case {"observer": str(function)}:
-                parts["observer"] = Observer(None, {}, function)
-            case {"observer": {"function": str(function)} as observer}:
+            case {"observer": {"function": {"ref": str(function)}} as observer}:
                 require_known("entry of the observer", observer, ["function", "states"])
-                parts["observer"] = Observer(None, observer.get("states", {}), function)
+                return LogMapping(**{**table, "observer": Observer(None, observer.get("states", {}), function)})
             case {"observer": given}:
-                raise InputError(f"an observer must name a function module:attr, got {given!r}.")
-        return LogMapping(**{**table, **parts})
+                example = 'function = { ref = "module:attr" }'
+                raise InputError(f"an observer must be a table with {example}, got {given!r}.")
+        return LogMapping(**table)
 
     @staticmethod
     def from_toml(path: str | Path) -> LogMapping:
@@ -240,7 +231,8 @@ def _field(name: str, described: Any) -> Field:
             return Field(described)
     if not isinstance(described, Mapping):
         raise InputError(f"the field {name} must be a path or a table, got {described!r}.")
-    table = {("path" if key == "field" else key): value for key, value in described.items()}
-    require_known(f"entry of the field {name}", table, [field.name for field in fields(Field)])
+    if "field" in described:
+        raise InputError(f"the field {name} has a path in place of a field: path = {described['field']!r}.")
+    require_known(f"entry of the field {name}", described, [field.name for field in fields(Field)])
     with reworded(f"the field {name}", InputError):
-        return Field(**({} if "derivative_of" in table else {"path": name}) | table)
+        return Field(**{**({} if "derivative_of" in described else {"path": name}), **described})

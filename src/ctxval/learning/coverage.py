@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from itertools import chain, combinations, product
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.texts import parted
@@ -46,7 +46,7 @@ def coverage(
         gaps[..., i] = np.minimum(np.abs(some[..., i] - ordered[above]), np.abs(some[..., i] - ordered[above - 1]))
     pairs, couples = None, list(map(list, combinations(range(len(width)), 2)))
     if len(width) <= most_coordinates:
-        trees = [(cKDTree(recorded[:, two]), two) for two in couples]
+        trees = [(scipy.spatial.cKDTree(recorded[:, two]), two) for two in couples]
         pairs = np.stack([tree.query(some[..., two], p=np.inf)[0] for tree, two in trees], axis=-1)
     # What is beyond all records weighs ten times as much as a gap in one coordinate, and a gap in two of them less.
     far = 10.0 * beyond.max(axis=(1, 2))
@@ -151,7 +151,7 @@ def largest_pocket(
     for i, j in places or couples:
         two, width = [i, j], widths[[i, j]]
         scale = np.full(2, width.max()) if places else width
-        away, _ = cKDTree(entered[:, two] / scale).query(some[:, two] / scale)
+        away, _ = scipy.spatial.cKDTree(entered[:, two] / scale).query(some[:, two] / scale)
         planes.append((away, two, scale))
     if not planes:
         return None
@@ -163,7 +163,7 @@ def largest_pocket(
         # The task whose run leaves the smallest pockets, large ones above all.
         few, left = _some(len(some), 1000), np.full(len(tasks), np.inf)
         for row in np.unique(of_task):
-            path = cKDTree(visited[of_task == row][:, two] / scale)
+            path = scipy.spatial.cKDTree(visited[of_task == row][:, two] / scale)
             left[row] = (np.minimum(away[few], path.query(some[few][:, two] / scale)[0]) ** 6).sum()
         next_tasks = tuple(map(tuple, tasks[[left.argmin(), of_task[rows[at]]]].tolist()))
     return UnvisitedRegion(
@@ -189,7 +189,7 @@ def away_from_executions(
     widths = np.ptp(_ends(visited[np.isfinite(visited).all(axis=1)], 0), axis=0)
     for two in map(list, positions):
         scale = max(float(widths[two].max()), 1e-9)
-        tree = cKDTree(entered[:, two] / scale)
+        tree = scipy.spatial.cKDTree(entered[:, two] / scale)
         for k, each in enumerate(loops):
             away[k] = np.maximum(away[k], tree.query(_finite(each.states[0][..., two] / scale))[0].max(axis=1))
     return away

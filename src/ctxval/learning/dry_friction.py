@@ -18,8 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import nnls
-from scipy.special import erf
+import scipy
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows
 from ctxval.core.model import Model
@@ -252,7 +251,9 @@ def found_friction(
         def by(acting: Array) -> tuple[Array, Array, float]:
             """Return forces, their sizes and what is left, if inputs change rates by ``acting`` ``(N, m, m)``."""
             forces = np.concatenate([-acting * shape[:, None, :] for shape in shapes], axis=2)
-            largest, norm = nnls(_beside(linear, forces / sizes[:, None]).reshape(-1, forces.shape[2]), left.ravel())
+            largest, norm = scipy.optimize.nnls(
+                _beside(linear, forces / sizes[:, None]).reshape(-1, forces.shape[2]), left.ravel()
+            )
             return forces, largest, float(norm)
 
         forces, largest, left_over = by(of_rates)
@@ -305,7 +306,9 @@ def _slowness(before: Array, after: Array, slow: Array) -> Array:
     """Return the mean of ``exp(-(rate / slow)^2)`` over steps in which rates change evenly; all shapes ``(..., m)``."""
     first, last = before / slow, after / slow
     same = np.abs(last - first) < 1e-4
-    mean = 0.5 * np.sqrt(np.pi) * (erf(last) - erf(first)) / np.where(same, 1.0, last - first)
+    mean = (
+        0.5 * np.sqrt(np.pi) * (scipy.special.erf(last) - scipy.special.erf(first)) / np.where(same, 1.0, last - first)
+    )
     return np.where(same, np.exp(-(first**2)), mean)
 
 

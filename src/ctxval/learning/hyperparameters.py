@@ -13,8 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.distance import cdist
-from scipy.special import gammaln, logsumexp
+import scipy
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
@@ -101,7 +100,7 @@ class ResidualKernel(Covariance):
         """Return K = k(Z, Z), and the function ``W -> sum_ij W_ij dK_ij/dtheta`` of a symmetric W."""
         constant, slope = np.exp(theta[-2:])
         scaled = Z / np.exp(theta[:-2])
-        profile, fall = Matern(self.nu).profile_and_slope(cdist(scaled, scaled))
+        profile, fall = Matern(self.nu).profile_and_slope(scipy.spatial.distance.cdist(scaled, scaled))
         linear = slope * (Z @ Z.T)
         K = self._grow(profile, Z, Z)
         K += linear
@@ -204,12 +203,16 @@ class HyperparameterPosterior:
                 proposals.append(mode.place + deviations @ mode.scale.T)
             drawn = np.concatenate(proposals)
             # All modes of a family make one proposal distribution: the mixture of theirs in equal parts.
-            constant = gammaln((freedom + D) / 2) - gammaln(freedom / 2) - 0.5 * D * np.log(freedom * np.pi)
+            constant = (
+                scipy.special.gammaln((freedom + D) / 2)
+                - scipy.special.gammaln(freedom / 2)
+                - 0.5 * D * np.log(freedom * np.pi)
+            )
             for mode in family:
                 squares = (np.linalg.solve(mode.scale, (drawn - mode.place).T) ** 2).sum(axis=0)
                 log_volume = np.linalg.slogdet(mode.scale)[1]
                 densities.append(constant - log_volume - 0.5 * (freedom + D) * np.log1p(squares / freedom))
-            density = logsumexp(densities, axis=0) - np.log(len(family))
+            density = scipy.special.logsumexp(densities, axis=0) - np.log(len(family))
             for place in drawn:
                 theta, noise = kernel.within(place)
                 try:

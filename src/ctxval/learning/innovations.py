@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from scipy.special import logsumexp
+import scipy
 
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.learning.features import Features, spread_rows
@@ -220,7 +220,7 @@ class _Spectrum:
         heights = [self.log_evidence(i, *self._grid).ravel() for i in range(len(self.squares))]
         length = np.log(self.settings.length)
         prior = -0.5 * (((theta[:-1] - length) ** 2).sum() + ((theta[-1] - length) / 3) ** 2)
-        return float(sum(logsumexp(each) - np.log(each.size) for each in heights) + prior)
+        return float(sum(scipy.special.logsumexp(each) - np.log(each.size) for each in heights) + prior)
 
     @functools.cached_property
     def _grid(self) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.model import Model
@@ -200,7 +200,7 @@ class _Search:
         moves = np.append(np.where(at[:-1] + steps <= high, steps, -steps), -2.0)
         simplex = at + np.concatenate([np.zeros((1, len(at))), np.diag(moves)])
         options = {"initial_simplex": simplex, "maxfev": self.evaluations, "xatol": 1e-5, "fatol": 1e-3}
-        best = minimize(unlikely, at, method="Nelder-Mead", options=options).x
+        best = scipy.optimize.minimize(unlikely, at, method="Nelder-Mead", options=options).x
         best[:-1] = np.clip(best[:-1], low, high)
         # Delays of whole steps are preferred as by the Bayesian information criterion.
         are_delays = [*(isinstance(each.effect, Delay) for each in effects for _ in each.parameters), False]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.distance import cdist
+import scipy
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.representation import ShortRepr
@@ -116,7 +116,7 @@ class LearnedDynamics(ShortRepr):
 
     def near_pool(self, points: Array) -> Array:
         """Return the distances on the posterior mean ``(m,)`` of the tasks of the pool next to points ``(m, d)``."""
-        nearest = cdist(points, self.search.pool).argmin(axis=1)
+        nearest = scipy.spatial.distance.cdist(points, self.search.pool).argmin(axis=1)
         return np.asarray(self._on_pool[0][nearest])
 
     @property

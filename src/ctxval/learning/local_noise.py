@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.distance import cdist
+import scipy
 
 from ctxval._util.arrays import Array
 
@@ -110,4 +110,4 @@ def _parts(pairs: Array, squares: Array, k: int, settings: LocalNoiseSettings) -
 
 def _near(pairs: Array, others: Array) -> Array:
     # The width of the kernel average is half a standard deviation of the data.
-    return np.asarray(np.exp(-0.5 * cdist(pairs, others, "sqeuclidean") / 0.5**2))
+    return np.asarray(np.exp(-0.5 * scipy.spatial.distance.cdist(pairs, others, "sqeuclidean") / 0.5**2))

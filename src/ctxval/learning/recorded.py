@@ -6,8 +6,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
+import scipy
 
 from ctxval._util.arrays import Rows
 from ctxval.core.model import Model, with_memory
@@ -80,9 +79,9 @@ def _nearest(data: Transitions, loops: Trajectory, count: int, *, many: bool = F
     scale = standard_deviations(here)
     # Transitions from which on a tree finds the nearest ones, in less memory than all distances need.
     if many or len(here) > 30_000:
-        gaps = cKDTree(there / scale).query(here / scale)[0]
+        gaps = scipy.spatial.cKDTree(there / scale).query(here / scale)[0]
     else:
-        gaps = cdist(here / scale, there / scale).min(axis=1)
+        gaps = scipy.spatial.distance.cdist(here / scale, there / scale).min(axis=1)
     return np.sort(np.argsort(gaps, kind="stable")[:count])
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.texts import parted
@@ -40,7 +40,7 @@ def push_response(
         visited = np.concatenate([loops.states.reshape(-1, n) for loops in planner.run(posterior.mean, planned)])
         low, high = np.quantile(visited[np.isfinite(visited).all(axis=1)], [1e-3, 1 - 1e-3], axis=0)
         widths = np.maximum(high - low, 1e-9)
-        recorded = cKDTree((data.pairs * data.scale + data.shift)[:, :n] / widths)
+        recorded = scipy.spatial.cKDTree((data.pairs * data.scale + data.shift)[:, :n] / widths)
         largest = []
         for near in (None, recorded):
             dynamics = pushed(posterior.mean, pushes.reshape(-1, n), widths, near)
@@ -56,7 +56,7 @@ def push_response(
 
 
 def pushed(
-    mean: DynamicsDraws, pushes: Array, widths: Array | float = 1.0, recorded: cKDTree | None = None,
+    mean: DynamicsDraws, pushes: Array, widths: Array | float = 1.0, recorded: scipy.spatial.cKDTree | None = None,
     near: float = 0.05,
 ) -> DisturbedDynamics:  # fmt: skip
     """Return a model that is pushed by ``(S, n)``, everywhere or away from records, in units of the widths ``(n,)``.

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.checked import Seconds, require_known
+from ctxval._util.checked import PositiveInt, require_known
 from ctxval._util.files import require_regular_file
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
@@ -33,7 +33,7 @@ from ctxval.systems.subprocess import signal_name
 _PROGRAM = Path(__file__).with_name("fmu_process.py")
 
 
-@part(files=("path",))
+@part(files=("source",))
 class FMU:
     """An FMU for co-simulation, FMI 2 or 3, as the true system.
 
@@ -42,31 +42,30 @@ class FMU:
     separate process, which is kept for the next execution; if the FMU crashes this process, the execution has failed.
 
     Args:
-        path: the ``.fmu`` file.
-        states, inputs: names of the variables that make up the state, and of the inputs; all are real numbers.
+        source: the ``.fmu`` file.
+        states, inputs: the variables that make up the state, and the inputs, with their units; all are real numbers.
         start: the variable whose start value sets a state, by the name of the state; by default its own variable. A
             state that the FMU calculates (``initial="calculated"``) often needs one, such as ``{"T": "T_start"}``.
         parameters: values of other variables, set before the initialisation.
-        step: the communication step size in seconds, of which a task's dt must be a whole multiple; by default the dt.
+        substeps: number of communication steps in one control step.
     """
 
     def __init__(
         self,
-        path: str | Path,
+        source: str | Path,
         *,
-        states: Sequence[str],
-        inputs: Sequence[str],
+        states: Mapping[str, str],
+        inputs: Mapping[str, str],
         start: Mapping[str, str] | None = None,
         parameters: Mapping[str, float | int | bool | str] | None = None,
-        step: Seconds | None = None,
+        substeps: PositiveInt = 1,
     ) -> None:
-        self.path = Path(path).absolute()
-        self.states, self.inputs = ((names,) if isinstance(names, str) else tuple(names) for names in (states, inputs))
-        for what, names in (("states", self.states), ("inputs", self.inputs)):
-            if len(set(names)) != len(names) or (what == "states" and not names):
-                raise InputError(f"{what} must be the names of different variables, got {list(names)}.")
+        self.path = Path(source).absolute()
+        self.states, self.inputs = dict(states), dict(inputs)
+        if not self.states:
+            raise InputError("states must be names of variables with their units, got none.")
         self.start = {name: name for name in self.states} | dict(start or {})
-        self.parameters, self.step = dict(parameters or {}), step
+        self.parameters, self.substeps = dict(parameters or {}), substeps
         self._open()
 
     def _open(self) -> None:
@@ -105,42 +104,39 @@ class FMU:
             raise InputError(str(error)) from error
 
     def describe(self) -> dict[str, Any]:
-        fields = ("states", "inputs", "start", "parameters", "step")
+        fields = ("states", "inputs", "start", "parameters", "substeps")
         return {"fmu": self._digest, **{name: getattr(self, name) for name in fields}}
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         require_one(task)
-        ratio = 1.0 if self.step is None else task.dt / self.step
-        if ratio < 0.5 or not np.isclose(ratio, round(ratio), rtol=1e-9, atol=0):
-            raise InputError(f"the task's dt must be a whole multiple of the step {self.step:g} s, got {task.dt:g} s.")
-        substeps = round(ratio)
         with self._process() as process:
-            self._start(process, task, task.dt / substeps, substeps)
+            self._start(process, task)
             trajectory = run_episode(process.advance, controller, task, len(self.inputs))
             process.sound = trajectory.ended == COMPLETE
             with contextlib.suppress(_CrashError):  # the execution is over
                 process.ask("free")
             return trajectory
 
-    def _start(self, process: _Process, task: Task, step: float, substeps: int) -> None:
+    def _start(self, process: _Process, task: Task) -> None:
         """Start an instance in the task's initial state.
 
         A state that is calculated by the description of the FMU may have no start value, and many FMUs calculate it in
         their first step only. So a very short step of another instance shows where such a state starts.
         """
         values: list[float | None] = task.initial_state.tolist()
+        names, step = list(self.states), task.dt / self.substeps
         shown = list[float]()
         if self._calculated and len(values) == len(self.states):
             try:
                 process.ask("begin", values, 1e-9 * step, 1)
             except InputError:  # the FMU refuses start values that its description does not have
                 process.ask("free")
-                own = [i for i in self._calculated if self.start[self.states[i]] == self.states[i]]
+                own = [i for i in self._calculated if self.start[names[i]] == names[i]]
                 values = [None if i in own else value for i, value in enumerate(values)]
                 process.ask("begin", values, 1e-9 * step, 1)
             shown = process.ask("advance", [])[0] or []
             process.ask("free")
-        state = process.ask("begin", values, step, substeps)
+        state = process.ask("begin", values, step, self.substeps)
         for i in self._calculated if shown else ():
             state[i] = shown[i]
         try:
@@ -148,9 +144,9 @@ class FMU:
         except InputError as error:
             if not shown:
                 raise
-            names = ", ".join(self.states[i] for i in self._calculated)
+            hidden = ", ".join(names[i] for i in self._calculated)
             advice = (
-                f"the FMU calculates {names}, and `start` names the parameters that set them: {self._candidates[:20]}"
+                f"the FMU calculates {hidden}, and `start` names the parameters that set them: {self._candidates[:20]}"
             )
             raise InputError(f"{str(error).removesuffix('.')}; {advice}.") from error
 
@@ -276,7 +272,7 @@ def _told(variable: Any) -> str:
     return f"{variable.name} (causality {variable.causality}, {variable.variability}, initial {variable.initial})"
 
 
-def _references(known: Mapping[str, Any], names: Sequence[str]) -> list[int]:
+def _references(known: Mapping[str, Any], names: Iterable[str]) -> list[int]:
     for name in names:
         variable = known[name]
         if variable.type not in ("Real", "Float64") or variable.dimensions:

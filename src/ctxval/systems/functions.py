@@ -45,13 +45,13 @@ class Function:
     """A plain function ``(controller, task) -> trajectory`` as the true system: a robot's own driver, a simulator.
 
     The function calls ``controller(t, x)`` for the inputs, once for each step in order if the controller has memory.
-    It returns a trajectory, or the states ``(H + 1, n)`` and the inputs ``(H, m)``; a batched one takes a batch of
-    tasks. If it raises an exception, the execution has failed for that reason. For a function of one step, ``(x, u) ->
-    x_next``, use a :class:`Simulated` system.
+    It returns a trajectory, or the states ``(H + 1, n)`` and the inputs ``(H, m)``; a vectorized one takes a batch
+    of tasks. If it raises an exception, the execution has failed for that reason. For a function of one step,
+    ``(x, u) -> x_next``, use a :class:`Simulated` system.
     """
 
-    def __init__(self, execute: Callable[[Feedback, Task], Any], *, batched: bool = False) -> None:
-        self.function, self.batched = execute, batched
+    def __init__(self, execute: Callable[[Feedback, Task], Any], *, vectorized: bool = False) -> None:
+        self.function, self.batched = execute, vectorized
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         returned = self.function(started(controller, task), task)

@@ -144,7 +144,7 @@ def test_settings_come_back_and_the_last_ones_count(tmp_path: Path) -> None:
     store = Store(tmp_path / "a.sqlite")
     assert store.settings() == {}
     store.keep_settings({"experiment": "pendulum", "budget": 5, "old": True})
-    kept = {"experiment": "pendulum", "budget": None, "search": {"name": "gp-ucb", "beta": 2.0}}
+    kept = {"experiment": "pendulum", "budget": None, "search": {"type": "gp-ucb", "beta": 2.0}}
     store.keep_settings(kept)
     store.close()
     assert Store(tmp_path / "a.sqlite").settings() == kept

@@ -215,11 +215,11 @@ def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
         ),
         ("repeats = 1", "repeats = 0", ("search.repeats",)),
         ("components = [0]", "componets = [0]", ("components",)),
-        ('name = "auto"', 'name = "gp-ucb"\nbeta = "two"', ("gp-ucb", "beta")),
-        ('name = "auto"', 'name = "gp-ucb"\ninitial = 2.5', ("gp-ucb", "initial")),
-        ('name = "auto"', 'name = "gp-ucb"\ninitial = true', ("gp-ucb", "initial")),
-        ('name = "auto"', 'name = "gp-ucb"\nkernel = "matern"', ("gp-ucb", "kernel")),
-        ('name = "auto"', 'name = "gp-ucb"\nnoise = 3', ("gp-ucb", "noise")),
+        ('type = "auto"', 'type = "gp-ucb"\nbeta = "two"', ("gp-ucb", "beta")),
+        ('type = "auto"', 'type = "gp-ucb"\ninitial = 2.5', ("gp-ucb", "initial")),
+        ('type = "auto"', 'type = "gp-ucb"\ninitial = true', ("gp-ucb", "initial")),
+        ('type = "auto"', 'type = "gp-ucb"\nkernel = "matern"', ("gp-ucb", "kernel")),
+        ('type = "auto"', 'type = "gp-ucb"\nnoise = 3', ("gp-ucb", "noise")),
         ('kind = "auto"', 'kind = "posteriour"', ("posterior",)),
         ('name = "cart"', 'name = "cart"\nexperiment = "pendulum"', ()),
         ('name = "cart"', 'name = "cart"\n[options]\nx = 1\n[other]', ()),
@@ -267,13 +267,13 @@ def test_the_file_says_the_largest_horizon_that_is_planned(invoke: Any, target: 
 @pytest.mark.slow
 def test_the_certificate_of_the_file_is_what_run_and_certify_judge_by(invoke: Any) -> None:
     scenario = ('kind = "auto"', 'kind = "scenario"\nvolume = 0.5')
-    target = changed(scenario, ('name = "auto"', 'name = "random"'))
+    target = changed(scenario, ('type = "auto"', 'type = "random"'))
     run = json.loads(invoke("run", target, "--no-report", "--json").stdout)
     assert (run["verdict"], run["certificate"]["kind"]) == ("validated", "scenario")
     certified = json.loads(invoke("certify", run["store"], "--threshold", "0.5", "--json").stdout)
     assert (certified["kind"], certified["verdict"]) == ("scenario", "validated")
     sentence(invoke("run", target, "--decide"))
-    adaptive = changed(scenario, ('name = "auto"', 'name = "gp-ucb"'))
+    adaptive = changed(scenario, ('type = "auto"', 'type = "gp-ucb"'))
     refused = json.loads(invoke("run", adaptive, "--store", "b.sqlite", "--no-report", "--json").stdout)
     assert refused["verdict"] == "undecided"
 
@@ -304,19 +304,19 @@ def test_a_model_is_learned_from_recorded_files(invoke: Any) -> None:
     Path("run2.npz").write_bytes(trajectory.to_npz())
     steps = trajectory.transitions()
     np.savez("steps.npz", x=steps.x, u=steps.u, x_next=steps.x_next)
-    assert len(recorded(["run1.csv", "run2.npz", "steps.npz"])) == 90
+    assert len(recorded({"logs": ["run1.csv", "run2.npz", "steps.npz"]})) == 90
     rows = zip(x.tolist(), [*u[:, 0].tolist(), 0.0], strict=True)
     matrices = "A = [[1.0, 0.05], [0.0, 1.0]]\nB = [[0.0], [0.05]]\n"
-    settings = read_settings(changed((matrices, 'data = ["run1.csv", "run2.npz"]\n')), {})
+    settings = read_settings(changed((matrices, 'data = { logs = ["run1.csv", "run2.npz"] }\n')), {})
     model = settings.load().validation.model
     np.testing.assert_allclose(model.A[0], [1, 0.05], atol=1e-9)  # type: ignore[attr-defined]
     # Columns with the names of the experiment's states and inputs, one of them in another unit.
     named = ["t,position [mm],speed,force", *(f"{0.05 * k},{1e3 * p},{v},{f}" for k, ((p, v), f) in enumerate(rows))]
     Path("named.csv").write_text("\n".join(named))
     names = {"states": {"position": "m", "speed": "m/s"}, "inputs": {"force": "N"}}
-    np.testing.assert_allclose(recorded(["named.csv"], None, names).x, steps.x, atol=1e-12)
+    np.testing.assert_allclose(recorded({"logs": ["named.csv"]}, None, names).x, steps.x, atol=1e-12)
     with refuses(InputError, "named.csv", "observation.state"):
-        recorded(["named.csv"])
+        recorded({"logs": ["named.csv"]})
     for data in ("none.csv", "experiment_system.py", ["x.npz"], [], 3):
         with pytest.raises(InputError):
             recorded(data)
@@ -324,7 +324,7 @@ def test_a_model_is_learned_from_recorded_files(invoke: Any) -> None:
         "\n".join(["t,position,speed,force", *(f"{50 * k},{p},{v},0" for k, (p, v) in enumerate(x))])
     )
     with refuses(InputError, 50, "ms.csv"):
-        recorded(["ms.csv"], None, names)
+        recorded({"logs": ["ms.csv"]}, None, names)
 
 
 # Any bytes
@@ -352,7 +352,7 @@ WHOLE: dict[str, Any] = {
     "model": {"type": "Linear", "A": [[1.0]], "B": [[1.0]]},
     "synthesizer": {"type": "LQR", "Q": [1.0], "R": [1.0]},
     "distance": {"type": "FinalState"},
-    "search": {"name": "gp-ucb", "beta": 1.0},
+    "search": {"type": "gp-ucb", "beta": 1.0},
     "certificate": {"kind": "posterior"},
 }
 
@@ -538,7 +538,7 @@ def test_a_flat_list_of_limits_in_a_file_is_refused(kind: str) -> None:
 def test_recorded_data_is_read_with_bounds(tmp_path: Path) -> None:
     path = tmp_path / "steps.npz"
     np.savez(path, x=np.zeros((3, 2)), u=np.zeros((3, 1)), x_next=np.ones((3, 2)))
-    assert recorded(str(path)).x_next.tolist() == [[1, 1]] * 3
+    assert recorded({"logs": [str(path)]}).x_next.tolist() == [[1, 1]] * 3
     header = np.lib.format.header_data_from_array_1_0(np.zeros(1)) | {"shape": (2**40, 2)}
     huge = io.BytesIO()
     np.lib.format.write_array_header_1_0(huge, header)
@@ -546,7 +546,7 @@ def test_recorded_data_is_read_with_bounds(tmp_path: Path) -> None:
         archive.writestr("x_next.npy", huge.getvalue())
         archive.writestr("x.npy", huge.getvalue())
     with refuses(InputError, "steps.npz", "x"):
-        recorded(str(path))
+        recorded({"logs": [str(path)]})
 
 
 def test_a_model_is_learned_from_logs_with_a_mapping(tmp_path: Path) -> None:
@@ -554,14 +554,17 @@ def test_a_model_is_learned_from_logs_with_a_mapping(tmp_path: Path) -> None:
     from rig_logs import DT, run, write_mcap_json
 
     write_mcap_json(tmp_path / "run.mcap", run())
-    mapping = {"states": ["/state.cart.position", "/state.cart.speed"], "inputs": ["/command.force"]}
-    model = part("model", {"type": "Linear", "data": {"logs": "run.mcap", **mapping}}, tmp_path)
+    states = {"position": "/state.cart.position", "speed": "/state.cart.speed"}
+    mapping = {"states": states, "inputs": {"force": "/command.force"}}
+    model = part("model", {"type": "Linear", "data": {"logs": ["run.mcap"], **mapping}}, tmp_path)
     np.testing.assert_allclose(model.A, [[1, DT], [0, 1 - 0.3 * DT]], atol=1e-9)
     assert len(model.data) == 60
-    with refuses(InputError, "data", "None"):
+    with refuses(InputError, "data", "logs"):
         part("model", {"type": "Linear", "data": mapping}, tmp_path)
     with refuses(InputError, "run.mcap", "observation.state"):
-        part("model", {"type": "Linear", "data": "run.mcap"}, tmp_path)
+        part("model", {"type": "Linear", "data": {"logs": ["run.mcap"]}}, tmp_path)
+    with refuses(InputError, "logs", "run.mcap"):
+        part("model", {"type": "Linear", "data": ["run.mcap"]}, tmp_path)
 
 
 COMPARABLE = "components = [0, 1]\nweights = [1.0, 2.0]\nscales = [0.1, 0.5]\nangles = [0]\n"
@@ -672,10 +675,10 @@ OUTPUTS = """
 outputs = {outputs}
 space = {{ goal = [-1.0, 1.0] }}
 task = {{ initial_state = [0.2, 0.0], goal = ["goal"], horizon = 12, dt = 0.05 }}
-system = "angles:rig"
-model = "angles:model"
+system = {{ type = "angles:rig" }}
+model = {{ type = "angles:model" }}
 synthesizer = {{ {synthesizer} }}
-distance = "MaximumDeviation"
+distance = {{ type = "MaximumDeviation" }}
 [states]
 angle = "rad"
 """
@@ -688,7 +691,9 @@ FILTERED = (
 )
 
 
-@pytest.mark.parametrize(("outputs", "synthesizer"), [*more(("[0]", PID), ("[0]", FILTERED)), ('"angles:angle"', PID)])
+@pytest.mark.parametrize(
+    ("outputs", "synthesizer"), [*more(("[0]", PID), ("[0]", FILTERED)), ('{ ref = "angles:angle" }', PID)]
+)
 def test_outputs_are_indices_or_a_function_of_a_module(outputs: str, synthesizer: str, invoke: Any) -> None:
     sys.modules.pop("angles", None)
     Path("angles.py").write_text(

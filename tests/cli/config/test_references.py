@@ -108,17 +108,17 @@ def calls() -> list[str]:
 @pytest.mark.parametrize(
     ("kind", "given", "expected"),
     [
-        ("system", "parts_here:rig", "Rig"),
-        ("system", "parts_here:Rig", "Rig"),
+        ("system", {"type": "parts_here:rig"}, "Rig"),
+        ("system", {"type": "parts_here:Rig"}, "Rig"),
         ("system", {"type": "parts_here:Rig", "speed": 3.0}, "Rig"),
-        ("system", "parts_here:make_rig", "Rig"),
+        ("system", {"type": "parts_here:make_rig"}, "Rig"),
         ("system", {"type": "parts_here:make_rig", "speed": 3.0}, "Rig"),
-        ("model", "parts_here:model", "Model"),
-        ("model", "parts_here:Model", "Model"),
-        ("model", "parts_here:step", "function"),
-        ("distance", "parts_here:distance", "function"),
-        ("distance", "parts_here:near", "Distance"),
-        ("distance", "parts_here:Distance", "Distance"),
+        ("model", {"type": "parts_here:model"}, "Model"),
+        ("model", {"type": "parts_here:Model"}, "Model"),
+        ("model", {"type": "parts_here:step"}, "function"),
+        ("distance", {"type": "parts_here:distance"}, "function"),
+        ("distance", {"type": "parts_here:near"}, "Distance"),
+        ("distance", {"type": "parts_here:Distance"}, "Distance"),
         ("distance", {"type": "parts_here:scaled", "scale": 2.0}, "partial"),
     ],
 )
@@ -129,19 +129,19 @@ def test_a_reference_names_a_part_or_what_makes_it(kind: str, given: Any, expect
 @pytest.mark.parametrize(
     ("kind", "given", "facts"),
     [
-        ("system", "parts_here:Other", ("system", "parts_here.Other")),
+        ("system", {"type": "parts_here:Other"}, ("system", "parts_here.Other")),
         ("system", {"type": "parts_here:Other", "args": "id > PWNED", "shell": True}, ()),
-        ("system", "parts_here:other", ("parts_here.Other",)),
-        ("system", "parts_here:model", ()),
-        ("system", "parts_here:step", ("system", "step")),
-        ("model", "parts_here:rig", ()),
-        ("model", "parts_here:steps", ("model", "steps")),
-        ("synthesizer", "parts_here:Rig", ()),
-        ("distance", "parts_here:Rig", ("model_trajectory", "system_trajectory")),
-        ("distance", "parts_here:builtin", ("builtin",)),
-        ("distance", "parts_here:absolute", ("numpy.ufunc",)),
-        ("distance", "parts_here:method", ("method",)),
-        ("distance", "parts_here:step", ("model_trajectory", "system_trajectory")),
+        ("system", {"type": "parts_here:other"}, ("parts_here.Other",)),
+        ("system", {"type": "parts_here:model"}, ()),
+        ("system", {"type": "parts_here:step"}, ("system", "step")),
+        ("model", {"type": "parts_here:rig"}, ()),
+        ("model", {"type": "parts_here:steps"}, ("model", "steps")),
+        ("synthesizer", {"type": "parts_here:Rig"}, ()),
+        ("distance", {"type": "parts_here:Rig"}, ("model_trajectory", "system_trajectory")),
+        ("distance", {"type": "parts_here:builtin"}, ("builtin",)),
+        ("distance", {"type": "parts_here:absolute"}, ("numpy.ufunc",)),
+        ("distance", {"type": "parts_here:method"}, ("method",)),
+        ("distance", {"type": "parts_here:step"}, ("model_trajectory", "system_trajectory")),
         ("system", {"type": "parts_here:rig", "speed": 1.0}, ()),
         ("system", {"type": "parts_here:method", "speed": 1.0}, ()),
     ],
@@ -161,7 +161,7 @@ def test_what_a_function_makes_must_be_a_part_too() -> None:
 @pytest.mark.parametrize("name", ["subprocess:Popen", "os:getcwd", "builtins:exec", "webbrowser:open", "sys:exit"])
 def test_pythons_own_library_has_no_parts(name: str) -> None:
     for kind in ("system", "model", "synthesizer", "distance"):
-        for given in (name, {"type": name, "args": "id > PWNED", "shell": True}):
+        for given in ({"type": name}, {"type": name, "args": "id > PWNED", "shell": True}):
             with refuses(InputError):
                 part(kind, given)
     with refuses(InputError, name):
@@ -171,14 +171,14 @@ def test_pythons_own_library_has_no_parts(name: str) -> None:
 def test_a_task_by_name_is_a_function_of_the_parameters() -> None:
     space = TaskSpace(goal=(0.0, 1.0))
     for name in ("task", "cached"):
-        assert callable(task_function(f"parts_here:{name}", space, None))
+        assert callable(task_function({"ref": f"parts_here:{name}"}, space, None))
     for name, facts in (
         ("step", ()),
         ("Rig", ("parts_here.Rig",)),
         ("builtin", ("builtin",)),
     ):
         with pytest.raises(InputError) as refused:
-            task_function(f"parts_here:{name}", space, None)
+            task_function({"ref": f"parts_here:{name}"}, space, None)
         assert_names(str(refused.value), *facts)
     assert calls() == []
 
@@ -247,7 +247,7 @@ def described(folder: Path, value: str, module: str = "step_here") -> Path:
         'name = "x"\nspace = { goal = [0.0, 1.0] }\n'
         'task = { initial_state = [0.0], goal = ["goal"], horizon = 3, dt = 0.1 }\n'
         f'system = {{ type = "Simulated", step = {{ ref = "{module}:step" }} }}\n'
-        'model = { type = "Linear", data = ["run.csv"] }\n'
+        'model = { type = "Linear", data = { logs = ["run.csv"] } }\n'
         'synthesizer = { type = "LQR", Q = [1.0], R = [1.0] }\n'
     )
     return folder / "experiment.toml"
@@ -354,15 +354,15 @@ def test_installed_modules_and_those_of_pythonpath_are_found(here: Path, monkeyp
 
 def test_files_are_sought_in_the_folder_unless_their_path_is_whole(here: Path) -> None:
     described(here / "one", "1.0")
-    assert len(recorded("run.csv", here / "one")) == 3
-    assert len(recorded(str(here / "one" / "run.csv"), here)) == 3
+    assert len(recorded({"logs": ["run.csv"]}, here / "one")) == 3
+    assert len(recorded({"logs": [str(here / "one" / "run.csv")]}, here)) == 3
     with refuses(InputError, "run.csv"):
-        recorded("run.csv", here)
+        recorded({"logs": ["run.csv"]}, here)
     for kind, table in (
         ("model", {"type": "Onnx", "source": "none.onnx"}),
         ("synthesizer", {"type": "OnnxPolicy", "source": "none.onnx"}),
         ("system", {"type": "MuJoCo", "mjcf": "none.xml"}),
-        ("system", {"type": "FMU", "path": "none.fmu", "states": ["x"], "inputs": ["u"]}),
+        ("system", {"type": "FMU", "source": "none.fmu", "states": {"x": ""}, "inputs": {"u": ""}}),
     ):
         with pytest.raises(InputError) as refused:
             part(kind, table, here / "one")

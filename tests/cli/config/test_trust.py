@@ -125,7 +125,7 @@ def rig_store(folder: Path, sentinel: str = "imported.txt") -> None:
 HOSTILE = {
     **PLAIN,
     "system": {"type": "subprocess:Popen", "args": "id > PWNED", "shell": True},
-    "task": "os:getcwd",
+    "task": {"ref": "os:getcwd"},
 }
 
 EVIL_CALL = {"type": "Subprocess", "command": ["sh", "-c", "id > PWNED"], "timeout": 5.0}
@@ -135,27 +135,30 @@ FILTERED = {"type": "OutputFeedback", "outputs": [0], "process": 0.1, "measureme
 ATTACKS: dict[str, dict[str, Any]] = {
     "issue": HOSTILE,
     "class": {**PLAIN, "system": HOSTILE["system"]},
-    "module": {**PLAIN, "task": "evil:task"},
-    "module alone": {**PLAIN, "task": "evil"},
-    "outputs": {**PLAIN, "outputs": "evil:outputs"},
-    "observer": {**PLAIN, "recordings": {"states": ["x"], "observer": "evil:estimate"}},
-    "inner part": {**PLAIN, "synthesizer": {**FILTERED, "synthesizer": "evil:make"}},
+    "module": {**PLAIN, "task": {"ref": "evil:task"}},
+    "module alone": {**PLAIN, "task": {"ref": "evil"}},
+    "outputs": {**PLAIN, "outputs": {"ref": "evil:outputs"}},
+    "observer": {**PLAIN, "recordings": {"states": {"x": "x"}, "observer": {"function": {"ref": "evil:estimate"}}}},
+    "inner part": {**PLAIN, "synthesizer": {**FILTERED, "synthesizer": {"type": "evil:make"}}},
     "inner class": {**PLAIN, "synthesizer": {**FILTERED, "synthesizer": {"type": "evil:Make"}}},
     "inner command": {**PLAIN, "system": {"type": "WithOutputs", "system": EVIL_CALL, "outputs": [0]}},
-    "inner inner": {**PLAIN, "synthesizer": {**FILTERED, "synthesizer": {**FILTERED, "synthesizer": "evil:make"}}},
+    "inner inner": {
+        **PLAIN,
+        "synthesizer": {**FILTERED, "synthesizer": {**FILTERED, "synthesizer": {"type": "evil:make"}}},
+    },
     "experiment": {"experiment": "evil:experiment"},
     "function": {**PLAIN, "model": {"type": "subprocess:getoutput", "cmd": "id > PWNED"}},
     "argument": {**PLAIN, "system": {"type": "Simulated", "step": {"ref": "evil:step"}}},
-    "distance": {**PLAIN, "distance": "evil:distance"},
-    "search": {**PLAIN, "search": {"name": "gp-ucb", "kernel": {"ref": "evil:kernel"}}},
+    "distance": {**PLAIN, "distance": {"type": "evil:distance"}},
+    "search": {**PLAIN, "search": {"type": "gp-ucb", "kernel": {"ref": "evil:kernel"}}},
     "options": {"experiment": "pendulum", "options": {"settings": {"ref": "evil:settings"}}},
     "command": {**PLAIN, "system": EVIL_CALL},
     "environment": {**PLAIN, "system": {"type": "Gymnasium", "environment": "evil:Environment-v0"}},
-    "fmu": {**PLAIN, "system": {"type": "FMU", "path": "evil.fmu", "states": ["x"], "inputs": ["u"]}},
+    "fmu": {**PLAIN, "system": {"type": "FMU", "source": "evil.fmu", "states": {"x": ""}, "inputs": {"u": ""}}},
     "installed distance": {**PLAIN, "distance": {"type": "Speed"}},
-    "installed search": {**PLAIN, "search": {"name": "corners", "repeats": 1}},
+    "installed search": {**PLAIN, "search": {"type": "corners", "repeats": 1}},
     "installed case": {"experiment": "swing"},
-    "folder": {**PLAIN, "task": "evil:task", "folder": "."},
+    "folder": {**PLAIN, "task": {"ref": "evil:task"}, "folder": "."},
     "deep": {**PLAIN, "system": {"type": "Simulated", "step": [[{"a": [{"ref": "evil:step"}]}]]}},
 }
 
@@ -190,7 +193,7 @@ def test_the_store_of_the_attack_runs_nothing_through_the_real_command_line(fold
     for process in started:
         said = process.communicate(timeout=60)[1]
         assert process.returncode == 2
-        assert "task = 'os:getcwd'" in said.replace("\n", " ")
+        assert "task = {'ref': 'os:getcwd'}" in said.replace("\n", " ")
         assert "id > PWNED" in said
     assert not list(folder.glob("PWNED*"))
 
@@ -212,7 +215,7 @@ assert not [event for event, _ in seen if event in ("subprocess.Popen", "os.syst
 @pytest.mark.slow
 def test_looking_at_a_store_imports_and_runs_nothing(folder: Path) -> None:
     plant(folder)
-    store_with({**HOSTILE, "model": "evil:model", "system": EVIL_CALL})
+    store_with({**HOSTILE, "model": {"type": "evil:model"}, "system": EVIL_CALL})
     done("status", "a.sqlite")
     result = subprocess.run([sys.executable, "-c", WATCHED], capture_output=True, text=True, timeout=60)
     assert result.returncode == 0, result.stdout + result.stderr
@@ -222,7 +225,9 @@ def test_looking_at_a_store_imports_and_runs_nothing(folder: Path) -> None:
 
 
 def test_what_is_shown_of_a_store_steers_no_terminal(folder: Path) -> None:
-    store_with({**PLAIN, "task": "evil:\x1b[2J\u202etask" + "a" * 10_000, "search": {"name": "auto", "\x1b[2J": {}}})
+    store_with(
+        {**PLAIN, "task": {"ref": "evil:\x1b[2J\u202etask" + "a" * 10_000}, "search": {"type": "auto", "\x1b[2J": {}}}
+    )
     said = refusal("ask", "a.sqlite")
     assert r"\x1b[2J\u202etask" in said
     assert "\x1b" not in said
@@ -368,13 +373,13 @@ def test_a_foreign_store_imports_no_part_of_an_installed_package(attack: str, si
 
 def test_what_the_user_names_may_be_of_an_installed_package(site: Path) -> None:
     lines = [f"{key} = {_toml(PLAIN[key])}" for key in ("space", "task", "system", "model", "synthesizer")]
-    Path("cart.toml").write_text("\n".join([*lines, 'distance = "Speed"', 'search = { name = "corners" }']))
+    Path("cart.toml").write_text("\n".join([*lines, 'distance = { type = "Speed" }', 'search = { type = "corners" }']))
     done("ask", "cart.toml", "--store", "a.sqlite")
     assert (site / "imported.txt").exists()
     done("ask", "a.sqlite")  # it is the user's own store
     shutil.rmtree(allowed_folder())
     said = refusal("ask", "a.sqlite")  # it is not any more
-    assert "distance = 'Speed'; search = {'name': 'corners', 'repeats': 1}" in said
+    assert "distance = {'type': 'Speed'}; search = {'repeats': 1, 'type': 'corners'}" in said
     done("ask", "a.sqlite", "--trust")
     done("ask", "a.sqlite")
 
@@ -433,11 +438,11 @@ def test_seed_and_search_remain_the_stores(folder: Path) -> None:
     kept = Store("a.sqlite").settings()
     shutil.rmtree(allowed_folder())
     done("ask", "a.sqlite", "--experiment", "my_rig:experiment")
-    assert (Store("a.sqlite").settings()["seed"], Store("a.sqlite").settings()["search"]["name"]) == (3, "random")
+    assert (Store("a.sqlite").settings()["seed"], Store("a.sqlite").settings()["search"]["type"]) == (3, "random")
     # but code is not taken along
-    search = {"name": "random", "kernel": {"ref": "evil:kernel"}}
+    search = {"type": "random", "kernel": {"ref": "evil:kernel"}}
     Store("a.sqlite").keep_settings({**kept, "search": search})
-    assert trusted_settings(Store("a.sqlite"), experiment="pendulum").search.name == "auto"
+    assert trusted_settings(Store("a.sqlite"), experiment="pendulum").search.type == "auto"
 
 
 def test_a_store_that_says_nothing_can_be_named(folder: Path) -> None:

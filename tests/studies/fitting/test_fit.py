@@ -21,7 +21,7 @@ from rig_logs import DT, run
 
 def recorded(runs: list[Trajectory]) -> Recordings:
     logs = [MemoryTable(f"run {k}", {"t": one.times, "x": one.states, "u": one.inputs}) for k, one in enumerate(runs)]
-    return recordings_of(logs, LogMapping.from_table({"states": ["x"], "inputs": ["u"]}))
+    return recordings_of(logs, LogMapping.from_table({"states": {"x": "x"}, "inputs": {"u": "u"}}))
 
 
 RUNS = [run(100, seed) for seed in range(8)]

@@ -33,7 +33,7 @@ def recorded(runs: list[Trajectory], **options: Any) -> Recordings:
         for k, one in enumerate(runs)
     ]
     states = {name: {"path": name, "unit": unit} for name, unit in (("position", "m"), ("speed", "m/s"))}
-    return recordings_of(logs, LogMapping.from_table({"states": states, "inputs": ["u"], **options}))
+    return recordings_of(logs, LogMapping.from_table({"states": states, "inputs": {"u": "u"}, **options}))
 
 
 RUNS = [run(120, seed) for seed in range(6)]
@@ -136,7 +136,7 @@ def test_a_state_that_is_not_recorded_is_found_in_the_step_before() -> None:
     position = [
         MemoryTable(f"run {k}", {"t": one.times, "x": one.states[:, 0], "u": one.inputs}) for k, one in enumerate(RUNS)
     ]
-    found = recordings_of(position, LogMapping.from_table({"states": ["x"], "inputs": ["u"]}))
+    found = recordings_of(position, LogMapping.from_table({"states": {"x": "x"}, "inputs": {"u": "u"}}))
     report = replay(models.Linear([[1.0]], [[0.0]]), found)
     assert report.residuals[0].history > 0.9
 
@@ -164,7 +164,7 @@ def test_a_delay_of_a_part_of_a_step_is_found(steps: float) -> None:
             acting = part * u[max(j - 1, 0)] + (1 - part) * u[max(j, 0)]  # the mean over the step
             speed[k + 1] = 0.99 * speed[k] + dt * acting
         logs.append(MemoryTable(f"run {number}", {"t": dt * np.arange(301), "speed": speed, "u": u}))
-    mapping = {"states": ["speed"], "inputs": ["u"]}
+    mapping = {"states": {"speed": "speed"}, "inputs": {"u": "u"}}
     model = models.Linear([[0.99]], [[dt]])
     (found,) = timing(model, recordings_of(logs, LogMapping.from_table(mapping)))[0]
     assert (found.kind, found.value) == ("delay", pytest.approx(steps * dt, abs=0.1 * dt))

@@ -30,7 +30,12 @@ def read(scale: float = 1.0, heads: tuple[str, str, str] = ("angle", "rate", "to
     for k, one in enumerate(RUNS):
         columns = {heads[0]: scale * one.states[:, 0], heads[1]: scale * one.states[:, 1], heads[2]: one.inputs}
         logs.append(MemoryTable(f"run {k}", {"t": one.times, **columns}))
-    return recordings_of(logs, LogMapping.from_table({"states": ["angle", "rate"], "inputs": ["torque"], **options}))
+    return recordings_of(
+        logs,
+        LogMapping.from_table(
+            {"states": {"angle": "angle", "rate": "rate"}, "inputs": {"torque": "torque"}, **options}
+        ),
+    )
 
 
 PLAIN, RAD, DEG = (
@@ -75,7 +80,7 @@ def test_a_model_file_states_units_and_logs_are_converted_to_them(suffix: str, t
 
 
 def test_states_in_another_order_are_taken_by_their_names() -> None:
-    turned = read(heads=("angle [rad]", "rate [rad/s]", "torque [N m]"), states=["rate", "angle"])
+    turned = read(heads=("angle [rad]", "rate [rad/s]", "torque [N m]"), states={"rate": "rate", "angle": "angle"})
     assert list(turned.states) == ["rate", "angle"]
     assert max(error.relative for error in replay(learned(RAD), turned, steps=[1]).errors) < 1e-3
 

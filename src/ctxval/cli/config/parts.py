@@ -31,13 +31,14 @@ REGISTRIES: dict[str, Registry[Any]] = {registry.kind: registry for registry in 
 Names = Mapping[str, Mapping[str, str]]  #: the ``states`` and the ``inputs`` of an experiment file, with units
 
 
-def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None, names: Names | None = None) -> Any:
+def part(kind: str, given: Mapping[str, Any], folder: Path | None = None, names: Names | None = None) -> Any:
     """Return a system, model, synthesizer or distance; ``names`` are looked for in recorded data of a model."""
     registry = REGISTRIES[kind]
-    table = {"type": given} if isinstance(given, str) else dict(given)
+    table = dict(given) if isinstance(given, Mapping) else {}
     name = table.pop("type", None)
     if not isinstance(name, str):
-        raise InputError(f"[{kind}] needs a type, such as {registry.built_in[0]!r} or 'module:attr'.")
+        example = f'type = "{given if isinstance(given, str) else registry.built_in[0]}"'
+        raise InputError(f"the {kind} must be a table with a type, such as {{ {example} }}, got {given!r}.")
     what = f"the {kind} {name}"
     if ":" in name:
         arguments = {key: argument(value, folder) for key, value in table.items()}
@@ -96,15 +97,14 @@ def argument(value: Any, folder: Path | None = None) -> Any:
     return value
 
 
-def recorded(files: Any, folder: Path | None = None, names: Names | None = None) -> Transitions:
-    """Return the transitions in recorded trajectories, in logs, or in an NPZ file with x, u and x_next."""
-    mapping = None
-    if isinstance(files, Mapping):
-        mapping = LogMapping.from_table({key: value for key, value in files.items() if key != "logs"})
-        files = files.get("logs")
-    paths = [files] if isinstance(files, str) else files
+def recorded(data: Any, folder: Path | None = None, names: Names | None = None) -> Transitions:
+    """Return the transitions in ``logs``, read by a mapping if one is given; NPZ files may have x, u and x_next."""
+    described = dict(data) if isinstance(data, Mapping) else {}
+    paths = described.pop("logs", None)
     if not paths or type(paths) is not list or {*map(type, paths)} != {str}:
-        raise InputError(f"data must be a file of recorded trajectories or a list of files, got {files!r}.")
+        example = 'logs = ["run1.csv", "folder"]'
+        raise InputError(f"data must be a table with a list of files, such as {{ {example} }}, got {data!r}.")
+    mapping = LogMapping.from_table(described) if described else None
     parts, logs = list[Transitions](), dict[str, list[Path]]()
     for path in (Path(folder or "", path) for path in paths):
         stored = None
@@ -150,10 +150,10 @@ def _component(entry: float | str, p: Parameters) -> Any:
     return -value if entry.startswith("-") else value
 
 
-def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any, folder: Path | None = None) -> Any:
-    """Return the map p -> task of an experiment file, from ``module:attr`` or from a table."""
-    if isinstance(given, str):
-        return require_function(f"the task {given}", reference(given, folder), "p -> Task")
+def task_function(given: Mapping[str, Any], space: TaskSpace, system: Any, folder: Path | None = None) -> Any:
+    """Return the map p -> task of an experiment file, from the reference of a function or from components."""
+    if set(given) == {"ref"}:
+        return require_function(f"the task {given['ref']}", reference(str(given["ref"]), folder), "p -> Task")
     require_known("entry of [task]", given, (*TaskTable.__dataclass_fields__, COMMAND))
     table = {"goal": None, "dt": getattr(system, "dt", None), **given}
     missing = [key for key in ("initial_state", "horizon", "dt") if table.get(key) is None]

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from ctxval import Campaign, Experiment, Store, TaskSpace, TaskSuite, Validation, searches
@@ -34,7 +34,7 @@ from ctxval.models import Refined, read_refined
 from ctxval.studies.aspect1 import TASKS
 from ctxval.studies.safety import judged_by
 
-Part = str | dict[str, Any]  #: ``module:attr``, or a table with a type and its arguments
+Part = dict[str, Any]  #: a table with a type, which may be ``module:attr``, and its arguments
 
 
 class CertificateTable(BaseModel, extra="allow"):
@@ -77,15 +77,22 @@ class CertificateTable(BaseModel, extra="allow"):
 
 
 class SearchTable(BaseModel, extra="allow"):
-    """The table ``[search]``: the name of a search, and its options."""
+    """The table ``[search]``: the type of a search, and its options."""
 
-    name: str = searches.DEFAULT
+    type: str = searches.DEFAULT
     repeats: int = Field(default=1, ge=1)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _typed(cls, given: Any) -> Any:
+        if isinstance(given, dict) and "name" in given:
+            raise PydanticCustomError("use", f"[search] has a type in place of a name: type = {given['name']!r}.")
+        return given
 
     def build(self, folder: Path | None = None) -> searches.Search:
         options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
-        options = require_types(f"search {self.name!r}", searches.REGISTRY.find(self.name), options)
-        return searches.by_name(self.name, repeats=self.repeats, **options)
+        options = require_types(f"search {self.type!r}", searches.REGISTRY.find(self.type), options)
+        return searches.by_name(self.type, repeats=self.repeats, **options)
 
 
 class Aspect1Table(BaseModel, extra="forbid"):
@@ -108,7 +115,9 @@ class SpecTable(BaseModel, extra="allow"):
         return judged_by(experiment, UnsafeMargin({"type": self.type, **(self.model_extra or {})}, margin=self.margin))
 
 
-RECORDED = "recorded"  #: the task function or the synthesizer of a file whose recorded system gives its tasks or inputs
+RECORDED = {
+    "type": "recorded"
+}  #: the task function or the synthesizer of a file whose recorded system gives its tasks or inputs
 _WHOLE = ("space", "task", "system", "model", "synthesizer")
 
 
@@ -135,7 +144,8 @@ class ExperimentSettings(BaseModel, extra="forbid"):
     longest: int | None = Field(default=None, ge=1, strict=True)
     start_tolerance: float | None = Field(default=None, ge=0, allow_inf_nan=False)
     physical: list[str] | None = None  #: the task parameters that change the dynamics, also of a named experiment
-    outputs: str | list[int] | None = None  #: the indices of M's states that are recorded, or a function of them
+    #: the indices of M's states that are recorded, or ``{ref = "module:attr"}``, a function of them
+    outputs: dict[str, str] | list[int] | None = None
     explore: bool | None = None  #: as the options of ``ctxval run``, so that a store knows the command that made it
     within: float = Field(default=WITHIN, gt=0, allow_inf_nan=False, strict=True)
     thinking: float | None = Field(default=None, gt=0)  #: seconds for one choice, verdict included
@@ -151,6 +161,15 @@ class ExperimentSettings(BaseModel, extra="forbid"):
     recordings: dict[str, Any] | None = None
     folder: Path | None = None  #: that of modules and files, as of the experiment file; None for the current one
     file: str | None = None  #: the name of the experiment file, for the commands that reports state
+
+    @field_validator("task", "system", "model", "synthesizer", "distance", "outputs", mode="before")
+    @classmethod
+    def _tables(cls, given: Any, field: ValidationInfo) -> Any:
+        if not isinstance(given, str):
+            return given
+        key = "ref" if field.field_name == "outputs" or (field.field_name == "task" and ":" in given) else "type"
+        form = f'{field.field_name} = {{ {key} = "{given}" }}'
+        raise PydanticCustomError("use", f"{field.field_name} must be a table, as in {form}, got {given!r}.")
 
     def load(self) -> Experiment:
         if self.experiment is None:
@@ -198,14 +217,15 @@ class ExperimentSettings(BaseModel, extra="forbid"):
             raise InputError(f"[options] is only for {named}; this file describes its own.")
         system: Any = part("system", self.system or {}, self.folder)
         if RECORDED in (self.task, self.synthesizer) and not isinstance(system, Recorded):
-            raise InputError(f"tasks and inputs that are {RECORDED!r} need a system of the type Recorded.")
+            raise InputError(f"tasks and inputs of the type {RECORDED['type']!r} need a system of the type Recorded.")
         box = {name: tuple(bounds) for name, bounds in (self.space or {}).items()}
         tasks: Any = system.names if self.suite is None and self.space is None else self.suite
         space = TaskSpace(**box) if tasks is None else TaskSuite(tasks)
         outputs: Any = self.outputs
-        if isinstance(self.outputs, str):
-            outputs = require_function("outputs", reference(self.outputs, self.folder), "x -> y")
-        default: Part = "FinalState"
+        if isinstance(self.outputs, dict):
+            require_known("entry of outputs", self.outputs, ["ref"])
+            outputs = require_function("outputs", reference(self.outputs.get("ref", ""), self.folder), "x -> y")
+        default: Part = {"type": "FinalState"}
         if self.spec is not None:  # d_a, of the states that the specification looks at
             default = {"type": "MaximumDeviation", "components": (self.spec.model_extra or {}).get("components")}
         task = (
@@ -261,7 +281,7 @@ class ExperimentSettings(BaseModel, extra="forbid"):
         if self.explore is not None:
             return self.explore
         # By default if a search other than `auto` or a certificate that ends no campaign is named.
-        return self.search.name != searches.DEFAULT or not is_decisive(self.certificate_options)
+        return self.search.type != searches.DEFAULT or not is_decisive(self.certificate_options)
 
     @property
     def log_mapping(self) -> LogMapping | None:
@@ -273,7 +293,7 @@ class ExperimentSettings(BaseModel, extra="forbid"):
             return self.store
         options = [f"{key}-{value}" for key, value in self.options.items()]
         # A name may have any characters, but the store must be in the folder.
-        names = re.sub(r"[/\\\x00-\x1f\x7f]", "-", "-".join([name, *options, self.search.name]))
+        names = re.sub(r"[/\\\x00-\x1f\x7f]", "-", "-".join([name, *options, self.search.type]))
         return Path("runs") / f"{names}-seed{self.seed}.sqlite"
 
 
@@ -296,8 +316,8 @@ def read_settings(target: str, overrides: dict[str, Any]) -> ExperimentSettings:
             raise InputError(f"[{key}] must be a table, got {table!r}.")
     options = {**options, **given.pop("options", {})}
     named = given.pop("search", None)
-    if named is not None and named != search.get("name", searches.DEFAULT):
-        search = {"name": named}  # the options in the file were those of another search
+    if named is not None and named != search.get("type", searches.DEFAULT):
+        search = {"type": named}  # the options in the file were those of another search
     whole = {**content, **given, "options": options, "search": search}
     if is_file:
         whole |= {"folder": Path(target).parent.resolve(), "file": Path(target).name}

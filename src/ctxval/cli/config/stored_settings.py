@@ -56,7 +56,7 @@ def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool
             stored = _of_store(kept)
             same["seed"] = stored.seed
             plain = not any(isinstance(value, dict) for value in (stored.search.model_extra or {}).values())
-            if plain and stored.search.name in searches.REGISTRY.built_in:  # which names no code
+            if plain and stored.search.type in searches.REGISTRY.built_in:  # which names no code
                 same["search"] = stored.search
         return named.model_copy(update=same)
     settings = _of_store(kept)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
+import scipy
 
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
@@ -309,7 +309,7 @@ class _Fit:
     def best(self, start: Array, sizes: Sequence[Array], evaluations: int) -> Array:
         inside = np.clip(start, self.low + 1e-9 * self.scales, self.high - 1e-9 * self.scales)
         bounds, options = (self.low, self.high), {"max_nfev": evaluations, "xtol": 1e-4, "ftol": 1e-5}
-        fitted = least_squares(
+        fitted = scipy.optimize.least_squares(
             lambda theta: self.errors(theta, sizes), inside, lambda theta: self.slope(theta, sizes)[1],
             bounds=bounds, x_scale=self.scales, **options,
         )  # fmt: skip

@@ -106,7 +106,7 @@ def run_command(settings: Mapping[str, Any], budget: int | None, *others: str, t
     search, certificate, options = (tables.get(name, {}) for name in ("search", "certificate", "options"))
     # The value of each option, and its default, with which it is left out.
     values = {
-        "--search": (search.get("name"), DEFAULT_SEARCH if named else None),
+        "--search": (search.get("type"), DEFAULT_SEARCH if named else None),
         "--seed": (settings.get("seed"), 0 if named else None),
         "--budget": (budget, None),
         "--threshold": (settings.get("threshold"), None),

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.special import stdtrit
+import scipy
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.checked import Must, require
@@ -247,7 +246,7 @@ def fit_parameters(
         return np.nan_to_num(left, nan=1e6, posinf=1e6, neginf=-1e6).clip(-1e6, 1e6)
 
     def best(start: Array, recorded: Transitions) -> Any:
-        return least_squares(
+        return scipy.optimize.least_squares(
             lambda theta: (errors(theta, recorded) / sizes).ravel(), start, bounds=(low, high), x_scale=high - low
         )
 
@@ -286,7 +285,7 @@ def _intervals(
     undetermined = (np.abs(weak) > 0.1).any(axis=0) if len(weak) else np.zeros(len(theta), dtype=bool)
     with np.errstate(all="ignore"):
         deviations = width * np.sqrt(variance * ((V / singular[:, None]) ** 2).sum(axis=0))
-    reach = np.where(undetermined, np.inf, deviations * stdtrit(degrees, 0.5 + confidence / 2))
+    reach = np.where(undetermined, np.inf, deviations * scipy.special.stdtrit(degrees, 0.5 + confidence / 2))
     parameters = []
     for i, name in enumerate(names):
         ends = zip(("lower", "upper"), bounds, strict=True)
