@@ -31,6 +31,7 @@ PAGES += sorted(DOCS.glob("reference/*.md"))
 NEEDS = {"gymnasium": ["gymnasium", "mujoco"], "mujoco": ["mujoco"], "fmu": ["fmpy", "pythonfmu"], "mpc": ["casadi"]}
 NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn"], "state-space": ["control"]}
 NEEDS |= {"policy-and-mjcf": ["mujoco"]}
+NEEDS |= {"pybullet": ["mujoco", "pybullet"]}
 NEEDS |= {"gymnasium-and-network": ["gymnasium", "mujoco", "sklearn"]}
 NEEDS |= {"fit": ["mujoco", "sklearn", "onnx"]}
 NEEDS |= {"clusters": ["submitit", "ray", "distributed"]}
@@ -38,7 +39,8 @@ NEEDS |= {"operate": ["starlette", "uvicorn", "jinja2", "python_multipart"]}
 LONG = ("aspect1", "causes", "clusters", "compare-controllers", "controllers", "envelope", "fit")
 LONG += ("gymnasium-and-network", "noise", "outputs", "retrain", "safety")
 LONG += ("choose-threshold", "decide", "experiment-file", "fmu", "operate", "report", "start", "watch", "workers")
-LONG += ("policy-and-mjcf", "replay")  # replay: an example and a script of the gallery replay recordings, too
+LONG += ("policy-and-mjcf", "pybullet")
+LONG += ("replay",)  # an example and a script of the gallery replay recordings, too
 """Pages that only `make docs` and `make thorough` run: long campaigns, several of them, or many processes."""
 CTXVAL = ["-c", "from ctxval.cli import main; main()"]
 

@@ -146,6 +146,11 @@ def mujoco() -> systems.MuJoCo:
     return systems.MuJoCo(MJCF, substeps=5)
 
 
+def pybullet() -> systems.PyBullet:
+    pytest.importorskip("pybullet")
+    return systems.PyBullet(MJCF, substeps=5)
+
+
 def mpc() -> controllers.MPC:
     pytest.importorskip("casadi")
     return controllers.MPC([1, 1], [1], steps=10, limits=5.0)
@@ -305,6 +310,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "systems.Gymnasium": gymnasium,
     "systems.Manual": lambda: systems.Manual(states={"angle": "rad"}, inputs={"torque": "N m"}, dt=0.02),
     "systems.MuJoCo": mujoco,
+    "systems.PyBullet": pybullet,
     "systems.Simulated": lambda: systems.Simulated(LINEAR),
     "systems.Subprocess": lambda: systems.Subprocess([sys.executable, "a b.py"], timeout=2.0),
     "models.FeedforwardReLU": neural_network,

@@ -139,11 +139,13 @@ def _card_of_servo(model: str) -> Card:
 
 
 def cause(told: dict[str, Any] | None) -> str:
-    """Return the cause that ``ctxval why`` names, or else what comes nearest."""
+    """Return the cause that ``ctxval why`` names, or else what the recordings show and what comes nearest."""
     if told is None:
         return ""
-    first, _, rest = str(told["sentence"]).partition(". ")
-    nearest = rest.partition(". ")[0]
+    first, *rest = str(told["sentence"]).split(". ")
+    if first.startswith("The recordings show: "):
+        return f"{first[21].upper()}{first[22:]}; in all, {rest[1][0].lower()}{rest[1][1:]}"
+    nearest = rest[0] if rest else ""
     return first if told["named"] or not nearest else f"none named; {nearest[0].lower()}{nearest[1:]}"
 
 

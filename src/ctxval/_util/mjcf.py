@@ -28,8 +28,7 @@ def compile_mjcf(mjcf: str | Path) -> tuple[str, Any]:
     """Return the digest of a model's files, and the compiled ``mujoco.MjModel``."""
     loader = require_extra("mujoco", "mujoco", "models of MuJoCo need").MjModel
     with reworded(f"the MuJoCo model {str(mjcf)!r} cannot be read", InputError):
-        is_text = is_mjcf_text(mjcf)
-        digest = _digest(str(mjcf).encode(), Path()) if is_text else _digest(read_bytes(mjcf), Path(mjcf).parent)
+        digest, is_text = digest_of(mjcf), is_mjcf_text(mjcf)
     with reworded("MuJoCo cannot compile the model", ValueError):
         return digest, loader.from_xml_string(str(mjcf)) if is_text else loader.from_xml_path(str(mjcf))
 
@@ -192,8 +191,9 @@ def instability(warning: str) -> str:
     return "terminated: " if warning.startswith("BADQ") else ""
 
 
-def _digest(text: bytes, home: Path) -> str:
-    """Return the digest of a model's text and of the files that it names: other models, meshes and height fields."""
+def digest_of(file: str | Path) -> str:
+    """Return the digest of an MJCF or a URDF and of the files that it names: other models, meshes, height fields."""
+    text, home = (str(file).encode(), Path()) if is_mjcf_text(file) else (read_bytes(file), Path(file).parent)
     digest, waiting, folders, known = hashlib.sha256(), [text], {home}, set[Path]()
     while waiting:
         text = waiting.pop()
@@ -206,5 +206,5 @@ def _digest(text: bytes, home: Path) -> str:
     return digest.hexdigest()[:16]
 
 
-_FILES = re.compile(rb"""\bfile\s*=\s*["']([^"'\0]+)""")
+_FILES = re.compile(rb"""\bfile(?:name)?\s*=\s*["']([^"'\0]+)""")
 _FOLDERS = re.compile(rb"""\b(?:mesh|asset)dir\s*=\s*["']([^"'\0]+)""")

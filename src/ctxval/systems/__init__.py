@@ -9,6 +9,7 @@ from ctxval.systems.fmu import FMU
 from ctxval.systems.functions import Function, Imperfect, Manual, rk4
 from ctxval.systems.gymnasium import Gymnasium
 from ctxval.systems.mujoco import MuJoCo
+from ctxval.systems.pybullet import PyBullet
 from ctxval.systems.subprocess import Subprocess
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "Imperfect",
     "Manual",
     "MuJoCo",
+    "PyBullet",
     "Recorded",
     "Simulated",
     "Subprocess",

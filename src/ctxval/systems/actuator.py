@@ -51,10 +51,8 @@ class Actuator:
         late, commands = self._late, np.moveaxis(inputs, -2, 0)
         padded = np.concatenate([np.zeros((late, *commands.shape[1:])), commands])
         due = self._due([padded[late - k : len(padded) - k] for k in range(late + 1)], parts)
-        reached = np.zeros_like(commands[0])
-        for t in range(len(due)) if np.any(self.lag) else ():
-            for k in range(parts):
-                due[t, ..., k, :], reached = self._followed(reached, due[t, ..., k, :], parts)
+        if np.any(self.lag):
+            due = self._all_followed(due, parts)
         return np.moveaxis(due[..., 0, :] if parts == 1 else due, 0, inputs.ndim - 2)
 
     def _due(self, commands: list[Array], parts: int) -> Array:
@@ -72,3 +70,16 @@ class Actuator:
         lag, missing = parts * np.asarray(self.lag)[..., None], reached - due
         gone = np.exp(-1 / np.maximum(lag, 1e-300))
         return due + missing * (lag * (1 - gone)), due + missing * gone
+
+    def _all_followed(self, due: Array, parts: int) -> Array:
+        """Return the means over all parts of all steps ``(H, ..., parts, m)`` of what approaches the inputs due."""
+        steps = np.moveaxis(due, -2, 1).reshape(-1, *due.shape[1:-2], due.shape[-1])
+        # What a lag reaches is a sum of inputs with weights g, g^2, g^3, ...: after k doublings, that of 2^k inputs.
+        gone = np.broadcast_to(np.exp(-1 / np.maximum(parts * np.asarray(self.lag)[..., None], 1e-300)), steps[0].shape)
+        reached, span, weight = (1 - gone) * steps, 1, gone
+        while span < len(steps) and weight.max() > 1e-18:
+            reached[span:] = reached[span:] + weight * reached[:-span]
+            span, weight = 2 * span, weight**2
+        before = np.concatenate([np.zeros_like(reached[:1]), reached[:-1]])
+        means, _ = self._followed(before, steps, parts)
+        return np.moveaxis(means.reshape(len(due), parts, *steps.shape[1:]), 1, -2)

@@ -73,7 +73,7 @@ def test_draws_run_together_as_alone(model: Model, n: int, m: int) -> None:
     for candidate in dictionary(model, n, m):
         require_equal_draws(model, (candidate.effect.with_sizes(drawn(candidate, rng)),), n, m)
         seen.add(type(candidate.effect).__name__)
-    fixed = {"ObservationDelay", "WrappedAngle", "Effect"}  # sizes that are counted
+    fixed = {"ObservationDelay", "WrappedAngle", "Effect", "JointStop"}  # sizes that are counted; and nothing stops
     # A constant force on a driven joint is an offset of its input.
     of_mujoco = {"JointAttribute", "BodyMass", "MassCentre"}
     assert m == 1 or seen == {kind.__name__ for kind in kinds()} - fixed - of_mujoco - {"Bias"}
@@ -90,6 +90,8 @@ def test_effects_act_together_in_draws() -> None:
         effects.Bias((0.1 * column,), effects.Joint(3, 1, 0.5), 0.1, DT),
         effects.TimeStep((column,)),
         effects.SensorScale((column,), (0, 2)),
+        effects.JointStop((0.2 * column, 40 * column), effects.Joint(2, 0), soft=True, dt=DT),
+        effects.JointStop((-0.1 * column,), effects.Joint(3, 1), upper=False, dt=DT),
     )
     require_equal_draws(ARM, chosen, 4, 2)
 

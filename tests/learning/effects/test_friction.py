@@ -71,3 +71,10 @@ def test_the_friction_of_verdicts_has_the_same_size(dt: float) -> None:
     found = found_friction(model, Transitions(*map(np.concatenate, zip(*rows, strict=True))))
     assert found is not None
     np.testing.assert_allclose(found.sliding, [0.4], rtol=1e-6)
+
+
+def test_friction_by_direction_brakes_each_way_by_its_own_size() -> None:
+    friction = ModelWithEffects(MODEL, (effects.DirectedFriction((0.4, 0.2), **FORCE),))
+    x, u = np.array([[0.0, 1.0], [0.0, -1.0], [0.0, 0.0], [0.0, 0.0]]), np.array([[0.0], [0.0], [0.39], [-0.21]])
+    rates = [1.0 - 0.4 * DT, -1.0 + 0.2 * DT, 0.0, -0.01 * DT]
+    np.testing.assert_allclose(friction.step(x, u)[:, 1], rates, atol=1e-12)

@@ -83,6 +83,19 @@ def test_dry_friction_and_a_delay_are_found_together() -> None:
 
 
 @pytest.mark.slow
+def test_a_stop_and_friction_by_direction_are_found() -> None:
+    def held(x: Array, u: Array) -> Array:
+        reached = slide(lambda position, speed, stopping: 0.0 * speed)(x, u)
+        stops = reached[..., 0] > 0.5
+        speed = np.where(stops & (reached[..., 1] > 0), 0.0, reached[..., 1])
+        return np.stack([np.minimum(reached[..., 0], 0.5), speed], axis=-1)
+
+    (stop,) = found(held).causes
+    assert (type(stop), stop.sizes) == (causes.JointStop, pytest.approx((0.5,), rel=1e-3))
+    (friction,) = found(slide(lambda position, speed, stopping: np.clip(stopping, -0.6, 0.2))).causes
+    assert (type(friction), friction.sizes) == (causes.DirectedFriction, pytest.approx((0.6, 0.2), rel=0.02))
+
+
 def test_noise_does_not_hide_a_weak_motor() -> None:
     weak = slide(no_force)
     report = found(lambda x, u: weak(x, 0.8 * u), measurement=[1e-3, 2e-3])

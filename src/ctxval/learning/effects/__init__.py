@@ -4,9 +4,10 @@ from ctxval.learning.effects.backlash import Backlash
 from ctxval.learning.effects.bias import Bias, InputDrift, InputOffset
 from ctxval.learning.effects.dead_zone import DeadZone
 from ctxval.learning.effects.effect import Effect, EffectCandidate, Parameter
-from ctxval.learning.effects.friction import Coulomb, FrictionAtRest, LoadFriction, Stribeck, Viscous
+from ctxval.learning.effects.friction import Coulomb, DirectedFriction, FrictionAtRest, LoadFriction, Stribeck, Viscous
 from ctxval.learning.effects.gain import InputGain, ReversedInput, SwappedInputs
 from ctxval.learning.effects.inertia import Gravity, Inertia
+from ctxval.learning.effects.joint_stop import JointStop
 from ctxval.learning.effects.model import ModelWithEffects
 from ctxval.learning.effects.mujoco import BodyMass, JointAttribute, MassCentre
 from ctxval.learning.effects.plant import Joint
@@ -22,6 +23,7 @@ __all__ = [
     "Coulomb",
     "DeadZone",
     "Delay",
+    "DirectedFriction",
     "Effect",
     "EffectCandidate",
     "FrictionAtRest",
@@ -32,6 +34,7 @@ __all__ = [
     "InputOffset",
     "Joint",
     "JointAttribute",
+    "JointStop",
     "Lag",
     "LoadFriction",
     "MassCentre",

@@ -95,6 +95,10 @@ class Effect(ShortRepr):
         """Return the flow of a step for the flow without this effect."""
         return flow
 
+    def allowed(self, x: Array) -> Array:
+        """Return the states ``(..., n)`` that the mechanics end a step in, for those without this effect."""
+        return x
+
     def seeing(self, controller: Controller) -> Controller:
         """Return a controller that sees what this effect lets it see of the records."""
         return controller

@@ -63,6 +63,26 @@ class Coulomb(Force):
 
 
 @dataclass(frozen=True)
+class DirectedFriction(Force):
+    """Coulomb friction that differs with the direction. Sizes: the magnitudes at positive and at negative rates."""
+
+    name: ClassVar[str] = "friction by direction"
+
+    @classmethod
+    def on_joint(cls, observed: Observed, where: Where, force: float, speed: float) -> Iterator[EffectCandidate]:
+        sizes = tuple(force_parameter(observed, where[0], name, force) for name in ("forwards", "backwards"))
+        yield EffectCandidate(cls((0.0, 0.0), *where), sizes, ((force, 0.3 * force), (0.3 * force, force)))
+
+    def force(self, before: Array, rate: Array, load: Array | float, stopping: Array) -> Array:
+        forwards, backwards = self.sizes
+        return limited(stopping, np.where(2 * rate > before, forwards, backwards))
+
+    def sentence(self, plant: Plant) -> str:
+        forwards, backwards = (self.amount(plant, size) for size in self.sizes)
+        return f"the friction of {plant.joint_name(self.joint)} is {forwards} forwards and {backwards} backwards"
+
+
+@dataclass(frozen=True)
 class FrictionAtRest(Force):
     """Coulomb friction that is larger at rest alone. Sizes: in motion, and what is added at rest.
 

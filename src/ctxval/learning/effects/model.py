@@ -18,7 +18,7 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError
 from ctxval.learning.draws import Draws
-from ctxval.learning.effects.effect import Effect
+from ctxval.learning.effects.effect import Effect, beside
 from ctxval.learning.effects.flow import Flow, Linearisation
 from ctxval.learning.effects.inputs import InputEffects
 from ctxval.models import MuJoCo
@@ -78,6 +78,10 @@ class ModelWithEffects(ShortRepr):
         return [effect for effect in self.effects if type(effect).within is not Effect.within]
 
     @functools.cached_property
+    def _at_ends(self) -> list[Effect]:
+        return [effect for effect in self.effects if type(effect).allowed is not Effect.allowed]
+
+    @functools.cached_property
     def of_inputs(self) -> InputEffects:
         """The effects of inputs."""
         acting = [effect for effect in self.effects if type(effect).act is not Effect.act]
@@ -133,7 +137,7 @@ class ModelWithEffects(ShortRepr):
             return self.reached(x, acting), memory
         mean = acting.mean(axis=-2) if acting.ndim > x.ndim else acting
         following, memory = advanced(self.mechanics, x, mean, memory)
-        if self._inside or acting.ndim > x.ndim:  # effects change what a step does, whatever M remembers
+        if self._inside or self._at_ends or acting.ndim > x.ndim:  # effects change steps, whatever M remembers
             following = following + self.reached(x, acting) - self.mechanics.step(x, mean)
         return following, memory
 
@@ -148,6 +152,9 @@ class ModelWithEffects(ShortRepr):
                     x = functools.reduce(lambda flow, effect: effect.within(flow), self._inside, flow).end(part)
                 else:
                     x = np.asarray(self.mechanics.step(x, acting))
+                if self._at_ends:
+                    ended = functools.reduce(lambda x, effect: effect.allowed(x), self._at_ends, x)
+                    x = np.where(beside(part) > 0, ended, x)
                 at = None
         return x
 

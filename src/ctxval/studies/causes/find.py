@@ -23,6 +23,7 @@ from ctxval.learning.effects.dictionary import candidates
 from ctxval.learning.effects.effect import Effect, EffectCandidate
 from ctxval.learning.effects.fit import Explanation, Segments, SegmentSettings, explained, screened
 from ctxval.learning.effects.force import Force
+from ctxval.learning.effects.joint_stop import seen_stops
 from ctxval.learning.effects.model import ModelWithEffects
 from ctxval.learning.effects.plant import plant_of
 from ctxval.learning.effects.sensor import SensorOffset, wrapped_angles
@@ -224,6 +225,9 @@ class _Study:
             raise InputError("the model's steps are not finite at the recorded states.")
         names = validation.names(x.shape[1], u.shape[1])
         self.plant = plant_of(self.model, executions[0].plan.task.dt, *names, x[usable], u[usable])
+        if not self.outputs:
+            states = [run.states for run in runs]
+            self.known = (*self.known, *seen_stops(self.plant.joints, states, following, self.plant.dt))
         seconds = max(run.horizon for run in runs) * self.plant.dt
         records = x[usable], u[usable], residuals[usable]
         self.dictionary = candidates(self.plant, *records, seconds=seconds, estimated=self.outputs)
@@ -279,6 +283,7 @@ class _Study:
             before=self.before,
             from_tasks=from_tasks,
             units=self.validation.labels.units,
+            seen=tuple(each.effect for each in self.known),
             separating=self._separating(group) if named and len(group) > 1 else None,
             ranked=tuple(ranked[:5]),
         )
@@ -297,7 +302,7 @@ class _Study:
 
     def _ranked(self, beside: tuple[EffectCandidate, ...]) -> list[Explanation]:
         """Return explanations by each cause beside given ones, the most probable first; the best of a screening."""
-        kinds = [each.effect.kind for each in beside]
+        kinds = [each.effect.kind for each in (*self.known, *beside)]
         results = []
         for each in self.dictionary:
             together = (*self.known, *beside, each)

@@ -71,6 +71,7 @@ class CauseReport(ShortRepr):
     tried: int  #: the number of causes in the dictionary
     executions: int  #: the number of executions that were learned from
     before: float  #: their largest distance from M
+    seen: tuple[Effect, ...] = ()  #: causes that recordings show by themselves, whatever else M lacks
     failed: int = 0  #: how many of them failed, of which only the steps before are known
     units: str = ""
     began_elsewhere: bool = False  #: whether M predicts from where executions began, and not from where tasks begin
@@ -95,7 +96,11 @@ class CauseReport(ShortRepr):
 
     @property
     def sentence(self) -> str:
-        """What M lacks, in one or two sentences."""
+        """What M lacks, in one to three sentences."""
+        seen = "" if self.named else "; ".join(cause.sentence(self.plant) for cause in self.seen)
+        return f"The recordings show: {seen}. {self._sentence()}" if seen else self._sentence()
+
+    def _sentence(self) -> str:
         units = f" {self.units}" if self.units else ""
         none = f"None of the {self.tried} causes that were tried"
         if self.began_elsewhere and not self.named:
@@ -174,6 +179,7 @@ class CauseReport(ShortRepr):
         return {
             "answer": "named" if self.named else "none of these",
             "sentence": self.sentence,
+            "seen": [cause.sentence(self.plant) for cause in self.seen],
             "separating": self.separating and {**asdict(self.separating), "sentence": self.separating_sentence},
             "explained": [
                 {
