@@ -44,7 +44,7 @@ from small_searches import run_few_loops, take_few_draws
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-pytest_plugins = ["browser"]
+pytest_plugins = ["browser", "pytester"]
 """Fixtures that tests of several folders use."""
 
 settings.register_profile("short", deadline=None, derandomize=True, max_examples=12)

@@ -18,7 +18,7 @@ from ctxval.report.charts import Axis, Chart
 from ctxval.report.context import ReportContext, context_of_campaign, context_of_store
 from ctxval.report.findings import Finding
 from ctxval.report.markup import bullets, element, heading, joined, paragraph, table
-from ctxval.report.page import SECTIONS, Section, junit, markdown, page, to_json, write_page
+from ctxval.report.page import SECTIONS, Section, junit, markdown, page, picture, to_json, write_page
 
 __all__ = [
     "SECTIONS",
@@ -40,6 +40,7 @@ __all__ = [
     "markdown",
     "page",
     "paragraph",
+    "picture",
     "table",
     "to_json",
     "write",

@@ -213,8 +213,41 @@ def junit(context: ReportContext) -> str:
     return f'<?xml version="1.0" encoding="utf-8"?>\n<!-- {MADE_BY} -->\n{content}\n'
 
 
+def picture(context: ReportContext) -> str:
+    """Return the executed distances and the threshold as a chart in Mermaid, which GitHub and GitLab draw.
+
+    With one task parameter, the distances are in its order; otherwise in the order of execution. Of many, the largest
+    40 are shown. It is empty if no distance is known.
+    """
+    trials = sorted(context.worst_first[:40], key=lambda trial: trial.number)
+    along = context.space.dimension == 1 and context.suite is None
+    names = [str(trial.number) for trial in trials]
+    if along:
+        trials.sort(key=lambda trial: float(trial.unit_point[0]))
+        names = [number(place) for place in context.coordinates(trials)[:, 0]]
+    if not trials:
+        return ""
+
+    def quoted(words: str) -> str:
+        return '"' + "".join(" " if letter in '"`<>;' else letter for letter in visible(words)) + '"'
+
+    shown, tau = [f"{distance_of(trial):.6g}" for trial in trials], context.threshold
+    limits = [] if tau is None else [f"  line [{', '.join([f'{tau:.6g}'] * len(shown))}]"]
+    top = 1.05 * max(float(context.distances.max()), tau or 0.0) or 1.0
+    lines = [
+        "```mermaid",
+        "xychart-beta",
+        f"  x-axis {quoted(context.task_labels[0] if along else 'trial')} [{', '.join(map(quoted, names))}]",
+        f"  y-axis {quoted(context.distance_label)} 0 --> {top:.4g}",
+        f"  bar [{', '.join(shown)}]",
+        *limits,
+        "```",
+    ]
+    return "\n".join(lines)
+
+
 def markdown(context: ReportContext) -> str:
-    """Return the report without its charts as Markdown; texts of the store cannot become markup."""
+    """Return the report as Markdown with one :func:`picture`; texts of the store cannot become markup."""
     units, verdict, known = context.labels.units, context.verdict, context.envelope
     answer = "No verdict: no threshold was given." if verdict is None else f"{verdict}"
     trials = context.worst_tasks()
@@ -239,6 +272,7 @@ def markdown(context: ReportContext) -> str:
         f"# Validation of {markdown_text(context.name) or 'campaign'}",
         f"**{markdown_text(answer)}**",
         f"{context.executions} executions, {len(context.failed)} without a distance.",
+        *filter(None, [picture(context)]),
         *([] if known is None else [markdown_text(f"{known.statement} {known.words}", UNCUT)]),
         *(block for title, lines in parts.items() for block in (f"## {title}", "\n".join(lines))),
         f"<!-- {MADE_BY} -->",
