@@ -9,7 +9,7 @@ from typing import Any, Literal
 from ctxval._util.checked import PositiveFloat, checked, require
 from ctxval._util.representation import ShortRepr, call, line, lines, shown
 from ctxval.certificates.base import KINDS, Certificate, CertificateKind
-from ctxval.certificates.bets import bets_against
+from ctxval.certificates.bets import Bets, bets_against
 from ctxval.certificates.bounds import NO_UNITS, Quantities
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.options import CONFIDENCE, CertificateOptions, Confidence, Volume
@@ -79,11 +79,11 @@ def counterexample(
     """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it.
 
     The distance of the steps before a failure counts, but less than that of whole executions. With noise, a single one
-    does not suffice (:mod:`ctxval.certificates.bets`), except in a suite, executed once. Nor does it falsify that a
+    does not suffice (:mod:`ctxval.certificates.bets`), except in a suite without repeats. Nor does it falsify that a
     ``share`` of the tasks stays below the threshold (:mod:`ctxval.certificates.task_share`).
     """
-    once = quantities.space is not None and quantities.space.members is not None
-    tau, bets = float(threshold), None if once or share < 1 else bets_against(trials, float(threshold), quantile)
+    tau = float(threshold)
+    bets = _bets(trials, tau, quantile, quantities) if share == 1 else None
     of_share = bets_on_share(trials, tau, share, confidence) if share < 1 else None
     if not all(each is None or each.falsify(confidence) for each in (bets, of_share)):
         return None
@@ -163,7 +163,7 @@ def judge(
     designs, remarks = designs_sentence(trials), list(verdict.remarks)
     parts = [verdict.reason.removesuffix("."), verdict.expected, designs]
     remarks += [] if designs is None else [designs]
-    bets = bets_against(trials, float(threshold), quantile) if share == 1 else None
+    bets = _bets(trials, float(threshold), quantile, known.quantities) if share == 1 else None
     if verdict.answer != "falsified" and bets is not None and bets.above:
         above = sentences.noise_may_explain(bets, float(threshold), known.quantities, chosen.confidence)
         parts.insert(0 if verdict.answer == "undecided" else len(parts), above)
@@ -173,13 +173,21 @@ def judge(
     return replace(verdict, reason=f"{reason}.{caution}", remarks=tuple(remarks))
 
 
+def _bets(trials: Sequence[Trial], threshold: float, quantile: float, quantities: Quantities) -> Bets | None:
+    """Return the bets against a threshold; None if one execution above it suffices."""
+    space = quantities.space
+    if space is None or space.members is None:
+        return bets_against(trials, threshold, quantile)
+    return bets_against(trials, threshold, quantile, noisy=True) if space.repeats > 1 else None
+
+
 def _certified(
     trials: Sequence[Trial], options: CertificateOptions, known: Provenance, threshold: float | None
 ) -> Certificate:
     """Return a certificate, for a threshold if there is one. Most kinds see countable draws only."""
-    suite = None if known.space is None else known.space.members
+    suite, repeats = (None, 1) if known.space is None else (known.space.members, known.space.repeats)
     sample, kind = Sample.of(trials, known.learned), options.kind
-    sample = replace(sample, distribution=known.distribution, suite=suite, threshold=threshold)
+    sample = replace(sample, distribution=known.distribution, suite=suite, repeats=repeats, threshold=threshold)
     if suite is not None:
         require_suite(kind)
     # No statement may count draws whose number depended on their distances.

@@ -62,8 +62,8 @@ class ResidualData:
     executions: Transitions  # those of executions, also of joints that friction holds
 
     def standardised(self, x: Array, u: Array) -> Array:
-        """Return standardised pairs ``(..., n + m)`` of states and the first m inputs, which act."""
-        return standardised_pairs(x, u[..., : self.inputs], self.shift, self.scale)
+        """Return standardised pairs ``(..., n + m)`` of states and acting inputs."""
+        return standardised_pairs(x, u, self.shift, self.scale)
 
 
 def residual_data(
