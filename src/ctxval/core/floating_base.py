@@ -157,6 +157,11 @@ class UntilFall(ShortRepr):
         named = getattr(self.distance, "with_states", None)
         return replace(self, distance=named(names)) if callable(named) else self
 
+    def with_quaternions(self, quaternions: Sequence[int]) -> UntilFall:
+        """Return the same with the quaternions of a model; see :class:`ctxval.distances.StateNorm`."""
+        turning = getattr(self.distance, "with_quaternions", None)
+        return replace(self, distance=turning(quaternions)) if callable(turning) else self
+
     def describe(self) -> dict[str, Any]:
         """Return what identifies this distance in a store."""
         return {"distance": self.distance, "fall": self.fall}

@@ -13,13 +13,14 @@ mode is found by Gauss-Newton steps, and draws come from population Monte Carlo 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model, advanced, with_memory
+from ctxval.core.state_geometry import PLAIN, StateGeometry, geometry_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.uncertain import UncertainModel
 
@@ -52,6 +53,7 @@ class Segments:
     inputs: Array  # (N, L, m)
     reached: Array  # recorded states after each step, (N, L, n)
     scale: Array  # of the errors of each state, (n,)
+    geometry: StateGeometry = PLAIN
 
     @classmethod
     def of(
@@ -70,17 +72,17 @@ class Segments:
         if not parts or len({part[2].shape for part in parts}) > 1:
             return None
         states, memory, inputs, reached = map(np.stack, zip(*parts, strict=True))
-        segments = cls(states, memory, inputs, reached, np.ones(states.shape[1]))
+        segments = cls(states, memory, inputs, reached, np.ones(states.shape[1]), geometry_of(model))
         errors = segments.errors(model)[0]
         finite = np.isfinite(errors).all(axis=(1, 2))
         if not finite.any():
             return None
         sizes = np.sqrt((errors[finite] ** 2).mean(axis=(0, 1)))
-        changes = np.sqrt(((reached[:, 0] - states) ** 2).mean(axis=0))
+        changes = np.sqrt((segments.geometry.difference(reached[:, 0], states) ** 2).mean(axis=0))
         # Chatter of numbers in a state that M predicts far better than others is no error that parameters explain.
         relative = np.divide(sizes, changes, out=np.zeros_like(sizes), where=changes > 0)
         scale = np.maximum(sizes, settings.chatter * relative.max(initial=0.0) * changes)
-        return cls(states, memory, inputs, reached, np.maximum(scale, 1e-12 + 1e-9 * np.abs(reached).max(axis=(0, 1))))
+        return replace(segments, scale=np.maximum(scale, 1e-12 + 1e-9 * np.abs(reached).max(axis=(0, 1))))
 
     def errors(self, model: Model, draws: int = 1) -> Array:
         """Return the errors ``(S, N, L, n)`` in units of the scale of a model, or of models of so many draws."""
@@ -92,7 +94,7 @@ class Segments:
         with np.errstate(all="ignore"):
             for step in range(self.inputs.shape[1]):
                 x, memory = advanced(model, x, of_draws(self.inputs[:, step]), memory)
-                errors.append((x - self.reached[:, step]) / self.scale)
+                errors.append(self.geometry.difference(x, self.reached[:, step]) / self.scale)
         return np.stack(errors, axis=2)
 
 
