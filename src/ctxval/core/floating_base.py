@@ -10,6 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.checked import NonNegativeInt, PositiveFloat, checked
+from ctxval._util.quaternions import normalised
 from ctxval._util.representation import ShortRepr
 from ctxval.core.distance import Distance
 from ctxval.core.task import Task
@@ -44,8 +45,7 @@ class FloatingBase(ShortRepr):
 
     def quaternion(self, x: Array) -> Array:
         """Return the unit quaternions ``(..., 4)`` of the base, w first."""
-        q = self._of_free(x)[..., self.position + 3 : self.position + 7]
-        return np.asarray(q / np.maximum(np.linalg.norm(q, axis=-1, keepdims=True), 1e-12))
+        return normalised(self._of_free(x)[..., self.position + 3 : self.position + 7])
 
     def gravity(self, x: Array) -> Array:
         """Return the unit vector ``(..., 3)`` of gravity in the body frame."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.quaternions import normalised, product
 from ctxval.core.model import Model
 
 
@@ -25,7 +26,7 @@ class StateGeometry:
         gap = np.asarray(x - y)
         for w in self.quaternions:
             at = slice(w, w + 4)
-            q = _product(y[..., at] * [1.0, -1.0, -1.0, -1.0], x[..., at])
+            q = product(y[..., at] * [1.0, -1.0, -1.0, -1.0], x[..., at])
             sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
             half = np.arctan2(sine, np.abs(q[..., :1]))
             with np.errstate(invalid="ignore"):
@@ -41,8 +42,7 @@ class StateGeometry:
             turn = np.broadcast_to(difference[..., w + 1 : w + 4], (*moved.shape[:-1], 3))
             angle = np.linalg.norm(turn, axis=-1, keepdims=True)
             half = np.concatenate([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * turn], axis=-1)
-            q = _product(np.broadcast_to(x[..., w : w + 4], half.shape), half)
-            moved[..., w : w + 4] = q / np.maximum(np.linalg.norm(q, axis=-1, keepdims=True), 1e-12)
+            moved[..., w : w + 4] = normalised(product(np.broadcast_to(x[..., w : w + 4], half.shape), half))
         return moved
 
     def features(self, x: Array) -> Array:
@@ -67,18 +67,3 @@ def geometry_of(model: Model) -> StateGeometry:
             return found
         inside = getattr(inside, "model", getattr(inside, "given", None))
     return PLAIN
-
-
-def _product(p: Array, q: Array) -> Array:
-    """Return the products ``(..., 4)`` of quaternions, w first."""
-    a, b, c, d = np.moveaxis(p, -1, 0)
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    return np.stack(
-        [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + (c * z - d * y),
-            a * y + c * w + (d * x - b * z),
-            a * z + d * w + (b * y - c * x),
-        ],
-        axis=-1,
-    )
