@@ -263,14 +263,15 @@ class CampaignDynamics:
         names, part = len(self.study.given.space.units) + 1, "the parameter that the dynamics seem to depend on"
         asks = evidence.failed is not None
         asks = asks and ledger.optional("learning", part, lambda costs: names * costs.learning())
-        influential = learned.influential
+        influential, executed = learned.influential, executed_trials(self._store, trials)
+        known_executions = [(trial.unit_point, trajectory) for trial, trajectory in executed]
         evidence = replace(
             evidence,
             executed=self._explained(learned, trials),
             influential=None if influential is None else tuple(influential.tolist()),
             drift=learned.drift,
             uneven=learned.uneven_friction,
-            suspect=learned.study.suspected_parameter(learned) if asks else None,
+            suspect=learned.study.suspected_parameter(learned, known_executions) if asks else None,
         )
         # How many tests a verdict needs is not known here. Negligible errors are no function to search, nor to push.
         if evidence.negligible or is_open(evidence, "learning", "coverage", "tested", "explained", "search"):
@@ -320,7 +321,7 @@ class CampaignDynamics:
     def _evidence(
         self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase, noise: float = 0.0, **known: Any
     ) -> Evidence:
-        noisy, actuator, predictions = learned.noisy, learned.study.actuator, list(self.checked(trials))
+        noisy, predictions = learned.noisy, list(self.checked(trials))
         # Drawn tests come with the distances of their tasks on what is learned by now.
         drawn = [k for k, test in enumerate(predictions) if test.is_test and not test.is_noisy]
         if drawn:
@@ -342,7 +343,7 @@ class CampaignDynamics:
             and (worst.points.shape[1] <= LIMITS.low_dimensional or bool(learned.values)),
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
-            actuator=None if actuator is None else (float(actuator.delay), float(actuator.lag)),
+            acting=learned.acting,
             friction=learned.friction,
             untested_rest=learned.untested_rest,
             parameters=learned.values,

@@ -39,7 +39,7 @@ from ctxval.errors import CertificateError
 
 # Attributes of the evidence that are numbers of the certificate as well.
 _COPIED = (
-    *("noise", "quantile", "lags", "actuator", "physical", "suspect", "without_model", "without_data", "estimated"),
+    *("noise", "quantile", "lags", "acting", "physical", "suspect", "without_model", "without_data", "estimated"),
     *("friction", "parameters", "peak_ratio", "jump", "search_shortfall", "disagreement", "negligible"),
 )
 MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence

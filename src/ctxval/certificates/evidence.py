@@ -48,7 +48,7 @@ class Evidence(ShortRepr):
     pushed: PushedDistances | None = None  #: largest distances under pushes; None if the bound is withdrawn anyway
     quantile: float | None = None  #: share of the executions of a task that are below the maxima; None without noise
     lags: int = 0  #: number of earlier records and inputs that the learned dynamics depend on
-    actuator: tuple[float, float] | None = None  #: delay and time constant of inputs in steps; None if they act at once
+    acting: Mapping[str, float] = field(default_factory=dict)  #: sizes of effects of inputs by labels, such as a delay
     #: the dry friction at each input, by its label, the most at rest if that is more, and its share of the input if it
     #: grows with it; empty if what M misses is smooth
     friction: Mapping[str, float] = field(default_factory=dict)

@@ -132,7 +132,7 @@ class DynamicsDraws(DrawsWithoutNoise):
 
     def _following(self, x: Array, u: Array, memory: Any) -> tuple[Array, Any]:
         shape = x.shape
-        x, acting = map(self._of_draws, (x, u[..., : self.data.inputs]))
+        x, acting = map(self._of_draws, (x, u))
         with np.errstate(all="ignore"):
             if isinstance(self.model, DryFriction):
                 following = self.model.following(x, acting, lambda inputs: self.residuals(x, inputs))

@@ -8,6 +8,7 @@ state is learned only if it predicts left-out executions, so that nothing that i
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
@@ -18,20 +19,24 @@ from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model, advanced, memory_in, predicted_steps, with_memory
 from ctxval.core.state_geometry import PLAIN, StateGeometry, geometry_of
-from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.core.trajectory import Trajectory
 from ctxval.core.uncertain import UncertainModel
 from ctxval.learning.draws import DrawsWithoutNoise
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
+from ctxval.learning.effects.uncertain import UncertainEffects
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
+from ctxval.learning.input_effects import Found
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.parameter_posterior import (
+    ParameterMode,
     ParameterPosterior,
     ParameterSettings,
     Segments,
     blocks_of,
-    parameter_posterior,
+    most_probable_effects,
 )
 from ctxval.learning.precision import agreeing_posterior
+from ctxval.learning.recorded import recorded_transitions
 from ctxval.learning.residual_data import ResidualData
 
 
@@ -179,6 +184,12 @@ class ParametricPosterior(ShortRepr):
     has_pivots: ClassVar[bool] = False
     noise: ClassVar[float] = 0.0  # rests are a part of draws
 
+    @property
+    def effects(self) -> Found:
+        """The effects of inputs beside the parameters."""
+        model = self.parameters.model
+        return model.effects if isinstance(model, UncertainEffects) else ()
+
     def functions_for(self, draws: int) -> int:
         """Return how many times the usual number of draws gives at least so many."""
         return max(1, -(-draws // self.settings.draws))
@@ -289,19 +300,27 @@ class ParametricDynamics(LearnedDynamics):
 def learned_parameters(
     model: UncertainModel,
     executed: Sequence[Trajectory],
-    recorded: tuple[Transitions, Rows],
+    loops: Trajectory,
     seed: tuple[int, ...],
+    candidates: Found = (),
+    known: Found | None = None,
     settings: ParametricSettings = ParametricSettings(),
 ) -> ParametricPosterior | None:
-    """Return the posterior of a model's uncertain parameters and of what they leave; None if nothing is usable."""
+    """Return the posterior of a model's uncertain parameters and of what they leave; None if nothing is usable.
+
+    Effects of inputs are looked for among candidates, or are the ``known`` ones; ``loops`` are closed loops on M.
+    """
     rng = np.random.default_rng(seed)
     with single_threaded(), np.errstate(all="ignore"):
         segments = Segments.of(model, executed, rng, settings.parameters)
         if segments is None:
             return None
-        parameters = parameter_posterior(model, segments, rng, settings.parameters)
-        fitted = _Single(model.drawn(parameters.mean[None]))
-        rest, plain = rest_of(fitted, executed, settings), agreeing_posterior(fitted, *recorded, seed)
+        mode = ParameterMode.of(model, segments, settings.parameters)
+        parameters = most_probable_effects(mode, candidates, known).posterior(rng)
+        fitted = _Single(parameters.model.drawn(parameters.mean[None]))
+        recorded = recorded_transitions(fitted, None, executed, loops)
+        plain = None if recorded is None else agreeing_posterior(fitted, *recorded, seed)
+        rest = rest_of(fitted, executed, settings)
     if rest is None or plain is None:
         return None
     horizon = max(trajectory.horizon for trajectory in executed)
@@ -315,11 +334,16 @@ class _Single:
     model: Model
 
     def step(self, x: Array, u: Array) -> Array:
-        return np.asarray(np.asarray(self.model.step(x[None], u[None]))[0])
+        return np.asarray(self.model.step(_one(x), _one(u))).reshape(x.shape)
 
     def start(self, x: Array) -> Array:
-        return np.asarray(memory_in(self.model, x[None])[0])
+        return memory_in(self.model, _one(x)).reshape(*x.shape[:-1], -1)
 
     def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
-        following, memory = advanced(self.model, x[None], u[None], memory[None])
-        return np.asarray(following)[0], memory[0]
+        following, after = advanced(self.model, _one(x), _one(u), _one(memory))
+        return np.asarray(following).reshape(x.shape), after.reshape(memory.shape)
+
+
+def _one(part: Array) -> Array:
+    """Return states, inputs or memories ``(..., k)`` as those of one draw ``(1, q, k)``."""
+    return part.reshape(1, -1, part.shape[-1]) if part.size else np.empty((1, math.prod(part.shape[:-1]), 0))

@@ -64,8 +64,8 @@ class ResidualData:
     geometry: StateGeometry = PLAIN  # of the states of M
 
     def standardised(self, x: Array, u: Array) -> Array:
-        """Return standardised pairs ``(..., n + m)`` of states and the first m inputs, which act."""
-        return standardised_pairs(self.geometry.features(x), u[..., : self.inputs], self.shift, self.scale)
+        """Return standardised pairs ``(..., n + m)`` of states and acting inputs."""
+        return standardised_pairs(self.geometry.features(x), u, self.shift, self.scale)
 
 
 def residual_data(

@@ -241,8 +241,8 @@ class Costs:
         share = (self.sizes.centres / 400) ** 2
         return self._own(curvature + hyperparameters * self.thinking.settings.component * max(share, 0.1))
 
-    def actuators(self) -> float:
-        """Return the seconds of a search for inputs that act late."""
+    def input_effects(self) -> float:
+        """Return the seconds of a search for effects of inputs, such as a delay."""
         return self._own(self._density() * (4 * 140 + 2 * 80 + 10))
 
     def friction(self) -> float:

@@ -34,7 +34,6 @@ Opened = TypeVar("Opened")
 
 _ICONS = {"validated": ":white_check_mark:", "falsified": ":x:", "failed": ":x:", "undecided": ":grey_question:"}
 _REPEAT = "repeat it"
-_STEP = 4  # executions between two looks at whether a candidate is not worse
 
 
 class Nightly:
@@ -149,7 +148,7 @@ class Nightly:
         before = made = sum(len(Candidate(name, each, 0).executed()) for name, each in campaigns.items())
         limit, decided = self._limit(budget, before), ""
         while not decided:
-            made = min(made + _STEP, max(limit, 1))
+            made = min(made + 4, max(limit, 1))  # between two looks at whether it is decided
             compared = compare(campaigns, question=question, budget=made, confidence=confidence, progress=False)
             pair, allowed = compared.pairs[0], tolerance * (compared.candidates[1].mean or 0.0)
             if pair.smaller == "candidate" or (pair.high is not None and pair.high <= allowed):

@@ -227,7 +227,7 @@ def dynamics_assumptions(evidence: Evidence) -> tuple[str, ...]:
             "noise is independent from step to step, like that of the records, and the dynamics do not change with "
             f"time or with the task{but}"
         )
-    acting, friction = late(evidence.actuator), rubbing(evidence.friction)
+    acting, friction = late(evidence.acting), rubbing(evidence.friction)
     searched = (
         f"the search of {evidence.evaluations} closed loops on the learned dynamics found the largest distance of each "
         "posterior sample"
@@ -258,7 +258,7 @@ def condition_on_dynamics(details: Mapping[str, Any]) -> str:
     if details["parameters"]:
         return " of M's uncertain parameters, if the system is M with other values of them, and errors as recorded"
     physical = details["physical"]
-    state, acting = state_of(details["estimated"]), late(details["actuator"])
+    state, acting = state_of(details["estimated"]), late(details["acting"])
     acting = f" ({acting})" if acting else ""
     friction = f"{rubbing(details['friction'])} and " if details["friction"] else ""
     lags = f" of the last {details['lags'] + 1} steps" if details["lags"] else ""
@@ -295,7 +295,7 @@ def conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
             complete = f"{'' if estimated else 'the '}{state_of(estimated)} being complete"
         noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
         alike = f"the system being deterministic{noise}, and its dynamics {changing}"
-    acting, friction = late(details["actuator"]), rubbing(details["friction"])
+    acting, friction = late(details["acting"]), rubbing(details["friction"])
     if details["parameters"]:
         values = in_words(details["parameters"])
         return [complete, alike, f"M having the right uncertain parameters ({values}), also where no execution was"]
