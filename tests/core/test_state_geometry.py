@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ctxval import Task, Trajectory, distances, models
+from ctxval import Task, TaskSpace, Trajectory, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
 from ctxval.core.state_geometry import PLAIN, StateGeometry, geometry_of
 from ctxval.core.trajectory import Transitions
@@ -110,3 +110,32 @@ def test_distances_compare_orientations_as_rotations() -> None:
         assert abs(float(found(run(first), run(turned), task)) - expected) < 1e-12
     assert distances.FinalState(components=[0, 3]).with_quaternions((3,)).quaternions == ()
     assert distances.FinalState(quaternions=["w"]).with_states(list("xyzwabc")).quaternions == (3,)
+
+
+def test_recorded_quaternions_of_any_sign_are_accepted() -> None:
+    """A system whose quaternions jump between q and -q is the same as one whose quaternions do not."""
+    pytest.importorskip("mujoco")
+    system, mjcf = systems.MuJoCo(MJCF.format(mass=1.2)), MJCF.format(mass=1)
+
+    class Flipping:
+        def execute(self, controller: controllers.Policy, task: Task) -> Trajectory:
+            run = system.execute(controller, task)
+            signs = np.random.default_rng(0).choice([-1.0, 1.0], (len(run.states), 1))
+            run.states[:, 3:7] *= signs
+            return run
+
+    def validation(of: object) -> Validation:
+        return Validation(
+            space=TaskSpace(spin=(-2.0, 2.0, "rad/s")),
+            task=lambda p: Task(
+                [0, 0, 1, 1, 0, 0, 0, 0.2, 1, *[0] * 6, p.spin, 0, 0, 0, 0, 0, 1], horizon=60, dt=0.005
+            ),
+            system=of,  # type: ignore[arg-type]
+            model=models.MuJoCo(mjcf),
+            synthesizer=controllers.Policy(lambda t, x, task: np.zeros((*x.shape[:-1], 0))),
+            distance=distances.MaximumDeviation(),
+        )
+
+    plain, flipping = (validation(each).outcome([0.7]) for each in (system, Flipping()))
+    assert plain.distance == flipping.distance > 1e-4
+    assert np.array_equal(plain.system_trajectory.states, flipping.system_trajectory.states)

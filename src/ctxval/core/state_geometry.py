@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.quaternions import normalised, product
+from ctxval._util.quaternions import continued, normalised, product
 from ctxval.core.model import Model
 
 
@@ -53,6 +53,16 @@ class StateGeometry:
         for w in self.quaternions:
             features[..., w : w + 4] *= np.copysign(1.0, x[..., w : w + 1])
         return features
+
+    def continued(self, states: Array, start: Array) -> Array:
+        """Return recorded states ``(N, n)``; of q and -q, that which continues from a first state ``(n,)``."""
+        if not self.quaternions:
+            return states
+        states = np.array(states)
+        for w in self.quaternions:
+            at = slice(w, w + 4)
+            states[:, at] = continued(np.concatenate([start[None, at], states[:, at]]))[1:]
+        return states
 
 
 PLAIN = StateGeometry()

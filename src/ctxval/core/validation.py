@@ -208,6 +208,10 @@ class Validation:
         tolerance = self.start_tolerance if start_tolerance is None else start_tolerance
         if not isinstance(trajectory, Trajectory):
             raise ExecutionError(f"the system returned {type(trajectory).__name__} instead of a Trajectory")
+        if (wanted := plan.task.initial_state).shape == trajectory.states.shape[-1:] and self.outputs is None:
+            geometry = geometry_of(self.model)
+            if geometry.quaternions and trajectory.states.ndim == 2:
+                trajectory = replace(trajectory, states=geometry.continued(trajectory.states, wanted))
         if ended_early(plan, trajectory) and (plan.model_trajectory.ended != COMPLETE or self.falls(trajectory)):
             return recorded_until_end(plan, trajectory, tolerance)
         require_complete(plan, trajectory)
