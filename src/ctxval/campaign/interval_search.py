@@ -131,8 +131,21 @@ class IntervalSearch:
             predictions = self.recorder.dynamics.checked(trials)
             if predictions and predictions[-1].held(self.best) and missing_tests(predictions, self.tests):
                 return self.test()
+        if self._repeats_suffice():
+            return None
         evidence = self._evidence()
         return self._by_distance() if evidence is None or self._fails(evidence) else self._by_dynamics(evidence)
+
+    def _repeats_suffice(self) -> bool:
+        """Return whether the tasks of a suite were executed so often that a quantile of each keeps the limit."""
+        space, trials = self.recorder.validation.space, self.recorder.trials.ended
+        if space.members is None or space.repeats == 1 or not trials:
+            return False
+        sample = replace(Sample.of(trials), suite=space.members, repeats=space.repeats)
+        with suppress(CertificateError):
+            whole = WholeSuite(self.options.kind.quantile).certify(sample, self.options.confidence)
+            return whole.covers(self.limit)
+        return False
 
     def test(self) -> Choice:
         """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""

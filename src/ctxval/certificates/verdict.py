@@ -9,7 +9,7 @@ from typing import Any, Literal
 from ctxval._util.checked import PositiveFloat, checked, require
 from ctxval._util.representation import ShortRepr, call, line, lines, shown
 from ctxval.certificates.base import KINDS, Certificate, CertificateKind
-from ctxval.certificates.bets import bets_against
+from ctxval.certificates.bets import Bets, bets_against
 from ctxval.certificates.bounds import NO_UNITS, Quantities
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.options import CONFIDENCE, CertificateOptions, Confidence, Volume
@@ -77,10 +77,9 @@ def counterexample(
     """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it.
 
     The distance of the steps before a failure counts, but less than that of whole executions. With noise, a single one
-    does not suffice (:mod:`ctxval.certificates.bets`), except in a suite, executed once.
+    does not suffice (:mod:`ctxval.certificates.bets`), except in a suite without repeats.
     """
-    once = quantities.space is not None and quantities.space.members is not None
-    tau, bets = float(threshold), None if once else bets_against(trials, float(threshold), quantile)
+    tau, bets = float(threshold), _bets(trials, float(threshold), quantile, quantities)
     if bets is not None and not bets.falsify(confidence):
         return None
     failed = without_success(trials)
@@ -154,7 +153,7 @@ def judge(
     designs, remarks = designs_sentence(trials), list(verdict.remarks)
     parts = [verdict.reason.removesuffix("."), verdict.expected, designs]
     remarks += [] if designs is None else [designs]
-    bets = bets_against(trials, float(threshold), quantile)
+    bets = _bets(trials, float(threshold), quantile, known.quantities)
     if verdict.answer != "falsified" and bets is not None and bets.above:
         above = sentences.noise_may_explain(bets, float(threshold), known.quantities, chosen.confidence)
         parts.insert(0 if verdict.answer == "undecided" else len(parts), above)
@@ -164,13 +163,21 @@ def judge(
     return replace(verdict, reason=f"{reason}.{caution}", remarks=tuple(remarks))
 
 
+def _bets(trials: Sequence[Trial], threshold: float, quantile: float, quantities: Quantities) -> Bets | None:
+    """Return the bets against a threshold; None if one execution above it suffices."""
+    space = quantities.space
+    if space is None or space.members is None:
+        return bets_against(trials, threshold, quantile)
+    return bets_against(trials, threshold, quantile, noisy=True) if space.repeats > 1 else None
+
+
 def _certified(
     trials: Sequence[Trial], options: CertificateOptions, known: Provenance, threshold: float | None
 ) -> Certificate:
     """Return a certificate, for a threshold if there is one. Most kinds see countable draws only."""
-    suite = None if known.space is None else known.space.members
+    suite, repeats = (None, 1) if known.space is None else (known.space.members, known.space.repeats)
     sample, kind = Sample.of(trials, known.learned), options.kind
-    sample = replace(sample, distribution=known.distribution, suite=suite, threshold=threshold)
+    sample = replace(sample, distribution=known.distribution, suite=suite, repeats=repeats, threshold=threshold)
     if suite is not None:
         require_suite(kind)
     # No statement may count draws whose number depended on their distances.

@@ -240,7 +240,7 @@ class Validation:
         return self._measured(plan.parameters.points, value)
 
     def remeasure(self, point: ArrayLike, model_trajectory: Trajectory, system_trajectory: Trajectory) -> float:
-        """Return d(p) between two known trajectories, as :meth:`measure` does, without the design of a controller."""
+        """Return d(p) at ``(d,)`` between known trajectories, as :meth:`measure` does; no controller is designed."""
         parameters = self.space.parameters(point)
         value = self.distance_between(model_trajectory, system_trajectory, self.task_at(parameters))
         return self._measured(parameters.points, value)

@@ -56,7 +56,7 @@ class StateNorm(NamedStates):
         return None if (factors == 1).all() else factors
 
     def difference(self, states: Array, others: Array) -> Array:
-        """Return the weighted differences ``states - others`` of the compared states; the leading axes broadcast."""
+        """Return the weighted differences of the compared ones of states ``(..., n)``; leading axes broadcast."""
         gap = selected(self.gap(states, others), self.components)
         counts = [len(given) for given in (self.weights, self.scales) if given is not None]
         if set(counts) - {gap.shape[-1]}:

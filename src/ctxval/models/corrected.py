@@ -162,7 +162,7 @@ class Refined(ShortRepr):
         return memory_in(self.model, x)
 
     def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
-        """Return the next states and the memory of the model, as :class:`ctxval.core.model.ModelWithMemory`."""
+        """Return the next states ``(..., n)`` and the memory, as :class:`ctxval.core.model.ModelWithMemory`."""
         return advanced(self.model, x, u, memory)
 
 

@@ -55,6 +55,9 @@ EXECUTED_AGAIN = (
 )
 """The assumption of a statement about executed tasks alone."""
 
+INDEPENDENT_REPEATS = "executions of one task are independent, and later ones are like those that were recorded"
+"""The assumption of a statement about repeated tasks."""
+
 
 # Independent draws
 

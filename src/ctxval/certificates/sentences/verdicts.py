@@ -24,7 +24,12 @@ from ctxval.certificates.bounds import (
 )
 from ctxval.certificates.covering import RESOLUTION, EmptyBox
 from ctxval.certificates.sample import executions_of
-from ctxval.certificates.sentences.statements import SMALL_ERRORS, condition_on_dynamics, conditions_on_dynamics
+from ctxval.certificates.sentences.statements import (
+    INDEPENDENT_REPEATS,
+    SMALL_ERRORS,
+    condition_on_dynamics,
+    conditions_on_dynamics,
+)
 from ctxval.certificates.sentences.withdrawals import REFINED
 from ctxval.core.learned_numbers import PushedDistances, Tolerance
 from ctxval.core.space import TaskSpace
@@ -115,6 +120,12 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
     """Return what is validated in one sentence: which tasks stay below the threshold, by which bound, if what holds."""
     upper, limit = _bound_and_limit(certificate, tau, quantities)
     kind, details, level = certificate.kind, certificate.details, percent(certificate.confidence)
+    if kind == "suite" and details.get("quantile"):
+        return (
+            f"with {level} confidence, each of {counted(details['tasks'], 'task')} of the suite stays at or below "
+            f"{limit} in at least {100 * details['quantile']:g} % of its executions: the bound is {upper}, from at "
+            f"least {counted(details['repeats'], 'execution')} of each."
+        )
     if kind == "suite":
         return (
             f"all {details['tasks']} tasks of the suite were executed, and no distance exceeds {limit}: the largest is "
@@ -280,6 +291,8 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
                 once = f"the noise being normal and alike everywhere ({bounded})"
             return [f"the distance being as smooth between the trials as at them{where}", once]
         case "suite":
+            if details.get("quantile"):
+                return [INDEPENDENT_REPEATS]
             return ["an execution of a task again giving the distance that was recorded"]
         case "audit" | "anytime" | "scenario" | "sampling-discarding":
             return [

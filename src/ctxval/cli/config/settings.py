@@ -219,8 +219,9 @@ class ExperimentSettings(BaseModel, extra="forbid"):
         if RECORDED in (self.task, self.synthesizer) and not isinstance(system, Recorded):
             raise InputError(f"tasks and inputs of the type {RECORDED['type']!r} need a system of the type Recorded.")
         box = {name: tuple(bounds) for name, bounds in (self.space or {}).items()}
+        repeats = system.repeats if isinstance(system, Recorded) else 1
         tasks: Any = system.names if self.suite is None and self.space is None else self.suite
-        space = TaskSpace(**box) if tasks is None else TaskSuite(tasks)
+        space = TaskSpace(**box) if tasks is None else TaskSuite(tasks, None, repeats)
         outputs: Any = self.outputs
         if isinstance(self.outputs, dict):
             require_known("entry of outputs", self.outputs, ["ref"])
