@@ -245,12 +245,12 @@ def data_uri(values: Array, low: float, high: float) -> str:
 def colour_scale(low: float, high: float, label: str) -> Markup:
     """Return the scale of a map."""
     shades = element(
-        "image", href=data_uri(np.linspace(0, 1, 64)[None], 0, 1), width=200, height=10, x=140,
+        "image", href=data_uri(np.linspace(0, 1, 64)[None], 0, 1), width=200, height=10, x=140, y=6,
         preserveAspectRatio="none",
     )  # fmt: skip
-    ends = element("text", number(low), x=134, y=10, class_="tick up"), element("text", number(high), x=346, y=10)
-    name = element("text", label, x=240, y=28, class_="axis-label")
-    return element("svg", shades, *ends, name, viewBox="0 0 480 34", class_="chart scale", aria_hidden="true")
+    ends = element("text", number(low), x=134, y=16, class_="tick up"), element("text", number(high), x=346, y=16)
+    name = element("text", label, x=240, y=34, class_="axis-label")
+    return element("svg", shades, *ends, name, viewBox="0 0 480 40", class_="chart scale", aria_hidden="true")
 
 
 def _path(at: Array, class_: str, *, closed: bool = False) -> Markup:
