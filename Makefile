@@ -11,7 +11,7 @@ export OMP_NUM_THREADS = 1
 unexport PYTHONDONTWRITEBYTECODE
 PIP := -m pip install --quiet --disable-pip-version-check --no-compile
 
-.PHONY: demo test suite quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine frozen reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo robots watch envelope friction safety causes clean
+.PHONY: demo test suite quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine frozen reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo robots watch envelope friction safety causes dist clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -158,6 +158,14 @@ parts: .venv/.test  ## the parts and the commands; writes docs/parts.md and docs
 	$(BIN)/python benchmarks/checks_page.py
 	$(BIN)/python benchmarks/parts_page.py
 	$(BIN)/python benchmarks/command_line_page.py
+
+dist: .venv/.test  ## the wheel and the source distribution, each at most 1.5 MB and tried in an empty environment
+	rm -rf dist && $(BIN)/python -m hatchling build
+	for file in dist/*; do \
+	  test $$(wc -c < $$file) -le 1500000 || { echo "$$file is too large"; exit 1; }; \
+	  rm -rf .venv/dist && $(PYTHON) -m venv .venv/dist && .venv/dist/bin/python $(PIP) $$file && \
+	  .venv/dist/bin/ctxval run pendulum --search random --budget 2 --store .venv/dist/try.sqlite || exit 1; \
+	done
 
 clean:
 	rm -rf .venv build dist docs/_build docs/auto_examples docs/reference/api

@@ -95,7 +95,7 @@ def decide(run: tuple[str, str, int, float]) -> dict[str, Any]:
         "noise": details.get("noise"),
         "quantile": details.get("quantile"),
         "lags": details.get("lags"),
-        "actuator": details.get("actuator"),
+        "acting": details.get("acting"),
         "bounds": _bounds(campaign, largest),
         "ranks": _ranks(campaign),
         "origins": [trial.origin for trial in campaign.trials],

@@ -9,10 +9,11 @@ from typing import Any
 from ctxval.certificates import Maxima, Sample, draw_maxima
 from ctxval.certificates.maxima import MaximaSettings
 from ctxval.gp.hyperposterior import draw_paths
-from ctxval.learning.actuators import ActuatorSettings
 from ctxval.learning.dynamics_posterior import PosteriorSettings
 from ctxval.learning.dynamics_study import LearningSettings
 from ctxval.learning.hyperparameters import FAMILIES
+from ctxval.learning.input_effects import InputEffectSettings
+from ctxval.learning.structure import StructureSettings
 from ctxval.learning.worst_case import WorstCaseSettings
 from ctxval.searches.trust_region import TrustRegionSettings
 
@@ -52,6 +53,6 @@ def run_few_loops(replace: Callable[[str, Any], None]) -> None:
     replace("ctxval.learning.worst_case.WorstCaseSettings.for_dimension", lambda *_: loops)
     replace("ctxval.learning.dynamics_posterior.PosteriorSettings.for_horizon", lambda *_: draws)
     replace("ctxval.searches.trust_region.TrustRegion.settings", TrustRegionSettings(shares=(0.15,)))
-    # Delays and lags of inputs are looked for in each campaign whose model errs: half of its time.
-    actuators = ActuatorSettings(learned_from=40, tried=((1.0, 0.0), (3.0, 0.0), (0.0, 1.5)))
-    replace("ctxval.learning.dynamics_study.LearningSettings", partial(LearningSettings, actuators=actuators))
+    # Effects of inputs are looked for in each campaign whose model errs: half of its time.
+    structure = StructureSettings(input_effects=InputEffectSettings(learned_from=40, climbed=2, evaluations=40))
+    replace("ctxval.learning.dynamics_study.LearningSettings", partial(LearningSettings, structure=structure))

@@ -168,10 +168,11 @@ def test_nothing_is_suspected_if_state_and_input_explain_the_executions() -> Non
         system=systems.Simulated(lambda x, u: cart(x, u, np.array(0.3)), vectorized=True)
     )
     study = DynamicsStudy(validation.with_parts(physical=()))
-    learned = study.learn(random_executions(validation, 8))
+    executed = random_executions(validation, 8)
+    learned = study.learn(executed)
     assert learned is not None
     assert learned.study is study
-    assert study.suspected_parameter(learned) is None
+    assert study.suspected_parameter(learned, executed) is None
 
 
 @pytest.mark.thorough  # one of test_actuators finds a parameter and a delay together

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from ctxval import models
 from ctxval.core.trajectory import Trajectory
-from ctxval.learning.parameter_posterior import ParameterSettings, Segments, blocks_of, parameter_posterior
+from ctxval.learning.parameter_posterior import ParameterMode, ParameterSettings, Segments, blocks_of
 
 TRUE = {"mass": 1.3, "drag": 0.4, "pull": -0.5}
 
@@ -41,7 +41,7 @@ def _posterior(executed: list[Trajectory], seed: int = 0) -> np.ndarray:
     model, rng = _model(), np.random.default_rng(seed)
     segments = Segments.of(model, executed, rng, ParameterSettings())
     assert segments is not None
-    drawn = parameter_posterior(model, segments, rng).draw(200, rng)
+    drawn = ParameterMode.of(model, segments, ParameterSettings()).posterior(rng).draw(200, rng)
     return np.stack([each.at(drawn[:, k]) for k, each in enumerate(model.uncertain)], axis=1)
 
 

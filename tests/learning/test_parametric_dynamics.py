@@ -8,6 +8,7 @@ import pytest
 from ctxval import Campaign, Task, TaskSpace, Validation, distances, models, systems
 from ctxval.core.space import Parameters
 from ctxval.core.trajectory import Trajectory
+from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.parametric_dynamics import (
     ParametricDraws,
     ParametricDynamics,
@@ -15,7 +16,6 @@ from ctxval.learning.parametric_dynamics import (
     learned_parameters,
     rest_of,
 )
-from ctxval.learning.recorded import recorded_transitions
 
 TRUE = {"mass": 1.2, "drag": 0.3, "pull": 0.4}
 
@@ -76,9 +76,7 @@ def _executions(validation: Validation, count: int) -> list[Trajectory]:
 
 def _learned(hidden: float = 0.0) -> tuple[ParametricPosterior, list[Trajectory]]:
     runs = _executions(_validation(hidden), 3)
-    recorded = recorded_transitions(MODEL, None, runs, runs[0])
-    assert recorded is not None
-    posterior = learned_parameters(MODEL, runs, recorded, (0, 3, 0))
+    posterior = learned_parameters(MODEL, runs, runs[0], (0, 3, 0))
     assert posterior is not None
     return posterior, runs
 
@@ -178,3 +176,30 @@ def test_a_wall_that_no_parameter_has_is_not_validated_where_few_tasks_meet_it(s
     campaign = Campaign(validation, seed=seed)
     campaign.run(20, threshold=threshold)
     assert campaign.verdict(threshold).answer != "validated"
+
+
+def _late(delay: float, lag: float) -> tuple[Validation, list[tuple[np.ndarray, Trajectory]]]:
+    def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return _mass_on_a_rail(x, u, np.array(list(TRUE.values())))
+
+    validation = _validation()
+    validation = validation.with_parts(system=systems.Imperfect(step, delay=delay, lag=lag, vectorized=True))
+    points = np.random.default_rng(0).random((3, 2))
+    runs = [validation.outcome(validation.space.from_unit(point)).system_trajectory for point in points]
+    return validation, list(zip(points, runs, strict=True))
+
+
+@pytest.mark.parametrize(("delay", "lag"), [(1.0, 0.0), (0.0, 2.0), (2.0, 1.5)])
+def test_a_delay_and_a_lag_are_found_beside_parameters(delay: float, lag: float) -> None:
+    validation, executed = _late(delay, lag)
+    learned = DynamicsStudy(validation).learn(executed)
+    assert isinstance(learned, ParametricDynamics)
+    values = {name: median for name, (median, *_) in learned.values.items()}
+    expected = {name: size for name, size in (("delay", delay), ("lag", lag)) if size}
+    assert {name: values[name] for name in ("delay", "lag") if name in values} == pytest.approx(expected, abs=0.05)
+    point = np.array([[0.9, 0.2]])
+    distance = validation.outcome(validation.space.from_unit(point[0])).distance
+    assert learned.expected(point)[0] == pytest.approx(distance, rel=0.02)
+    prediction = learned.predict(point[0])
+    assert prediction is not None
+    assert prediction.median == pytest.approx(distance, rel=0.02)

@@ -68,15 +68,9 @@ def of_tasks(distribution: str | None) -> str:
     return "of the tasks" if distribution is None else "of the tasks under the stated distribution"
 
 
-def late(actuator: Sequence[float] | None) -> str:
-    """Return how inputs act, given their delay and their time constant in steps; empty if they act at once."""
-    if actuator is None:
-        return ""
-    (delay, lag), at_once = actuator, 0.05
-    delayed, slow = (f"{each:.2g} step{'' if f'{each:.2g}' == '1' else 's'}" for each in actuator)
-    parts = [f"{delayed} late"] if delay > at_once else []
-    parts += [f"with a time constant of {slow}"] if lag > 5 * at_once else []
-    return f"acting {' and '.join(parts)}" if parts else ""
+def late(acting: Mapping[str, float]) -> str:
+    """Return how inputs act, such as ``acting with a delay of 2 steps``; empty if commands act as they are."""
+    return f"acting with {with_units(acting)}" if acting else ""
 
 
 def rubbing(friction: Mapping[str, float]) -> str:

@@ -37,7 +37,9 @@ class UncertainParameter:
 class UncertainModel(Model, Protocol):
     """A model that knows which of its parameters are uncertain."""
 
-    uncertain: Sequence[UncertainParameter]
+    @property
+    def uncertain(self) -> Sequence[UncertainParameter]:
+        """The uncertain parameters."""
 
     def drawn(self, z: Array) -> Model:
         """Return S models with standardised parameters ``(S, K)``, run together: a draw is the first axis of states."""

@@ -15,6 +15,7 @@ from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import moves_to_bounds
 from ctxval._util.progress import advance
 from ctxval.core.controller import Controller, ControllerWithMemory, started
+from ctxval.core.model import Step
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -22,6 +23,7 @@ from ctxval.core.validation import Validation
 from ctxval.errors import DistanceError
 from ctxval.learning.draws import Draws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
+from ctxval.learning.effects.inputs import NO_EFFECTS, InputEffects
 from ctxval.learning.noisy_draws import NoisyPosterior
 
 T = TypeVar("T")
@@ -46,7 +48,7 @@ class Loops:
 
     distances: Array  # d, (S, q); NaN if the loop of M diverges, infinity if that of a drawn system does
     states: Array  # shape (S, q, H + 1, n)
-    inputs: Array  # shape (S, q, H, m)
+    inputs: Array  # those that act, shape (S, q, H, m)
 
 
 class LoopPlanner:
@@ -54,10 +56,13 @@ class LoopPlanner:
 
     The latest plans are kept, up to about ``kept_bytes``. Tasks that are planned together are kept together, because a
     controller of a batch need not have parts; they are found again if the same points are asked for in the same order.
+    In drawn systems, inputs have ``effects``; M has none.
     """
 
-    def __init__(self, validation: Validation, kept_bytes: int = 64_000_000) -> None:
-        self.validation, self.kept_bytes = validation, kept_bytes
+    def __init__(
+        self, validation: Validation, effects: InputEffects = NO_EFFECTS, kept_bytes: int = 64_000_000
+    ) -> None:
+        self.validation, self.effects, self.kept_bytes = validation, effects, kept_bytes
         self._together: bool | None = None
         self._kept: OrderedDict[bytes, tuple[list[PlannedTasks], int]] = OrderedDict()
         self._size = 0
@@ -157,16 +162,35 @@ class LoopPlanner:
         rows = rows.reshape(L, *task.batch_shape)
         if self._takes_draws_together(planned, L):
             first, step = draws.begun(rows, tasks, np.repeat(task.initial_state[None], L, axis=0))
-            together = rollout(step, planned.controller, task.starting_at(first))
+            together = rollout(self.with_effects(step), planned.controller, task.starting_at(first))
             loops = [Trajectory(together.times, together.states[k], together.inputs[k]) for k in range(L)]
         else:
             alone = (draws.begun(each, tasks, task.initial_state) for each in rows)
-            loops = [rollout(step, planned.controller, task.starting_at(first)) for first, step in alone]
+            loops = [
+                rollout(self.with_effects(step), planned.controller, task.starting_at(first)) for first, step in alone
+            ]
         loops = [self._until_fall(loop, task) for loop in loops]
         states, inputs = np.stack([loop.states for loop in loops]), np.stack([loop.inputs for loop in loops])
         shape = L, len(planned.rows)
         distances = np.array([self.compared(planned, loop) for loop in loops]).reshape(shape)
+        inputs = self.effects.acting(inputs)
         return Loops(distances, *(part.reshape(*shape, *part.shape[-2:]) for part in (states, inputs)))
+
+    def with_effects(self, step: Step) -> Step:
+        """Return a step for the inputs that are commanded, which is called once for each step of a loop."""
+        if not self.effects.effects:
+            return step
+        memory = None
+
+        def following(x: Array, u: Array) -> Array:
+            nonlocal memory
+            u = np.array(u, dtype=np.float64)
+            if memory is None:
+                memory = np.zeros((*u.shape[:-1], self.effects.remembered(u.shape[-1])))
+            acting, memory = self.effects.act(u, memory)
+            return step(x, acting)
+
+        return following
 
     def _takes_draws_together(self, planned: PlannedTasks, draws: int) -> bool:
         """Return whether controllers take draws as another first axis; if not, one loop is run after the other."""

@@ -19,43 +19,34 @@ from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.uncertain import uncertain_in
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
-from ctxval.learning.actuators import ActuatorSettings, found_actuator
 from ctxval.learning.closed_loops import LoopPlanner, unseen_parameters
-from ctxval.learning.dry_friction import DryFriction, FrictionSettings, found_friction
+from ctxval.learning.dry_friction import DryFriction
 from ctxval.learning.dynamics_posterior import LearnedCovariances, PosteriorSettings, condition, learn_covariances
+from ctxval.learning.effects.inputs import InputEffects
 from ctxval.learning.extended import ExtendedValidation
-from ctxval.learning.histories import Record
+from ctxval.learning.input_effects import Found, input_candidates
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import NoiseSettings, NoiseStudy
 from ctxval.learning.parametric_dynamics import ParametricDynamics, ParametricSettings, learned_parameters
 from ctxval.learning.precision import AgreeingDynamics, AgreementSettings, agreeing_posterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
-from ctxval.learning.recorded import data_near, digest, recorded_transitions, schedule, scheduled
+from ctxval.learning.recorded import data_near, digest, recorded_transitions, scheduled
 from ctxval.learning.regular import RegularSettings, split_transitions
+from ctxval.learning.share_search import ShareSearch
 from ctxval.learning.stage_costs import Costs, Ledger, ThinkingSettings, reduced
+from ctxval.learning.structure import StructureSearch, StructureSettings, most_telling
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
-from ctxval.systems.actuator import Actuator
 
 
 @dataclass(frozen=True)
 class LearningSettings:
-    """How many executions, and how much smaller errors of left-out ones, show that the dynamics have a further part."""
+    """How dynamics are learned from executions."""
 
-    small_error: float = 0.1  # left-out error below which no further part is looked for
-    clear_factor: float = 3.0  # by which errors must fall without M's data, or with a task parameter, to be small
-    actuator_error: float = 0.02  # left-out error below which nobody asks whether inputs act late
-    actuator_from: int = 3  # executions from which on delays, and wrong data that M was made from, are looked for
-    friction_from: int = 4  # executions from which on dry friction is looked for
-    parameter_from: int = 6  # executions from which on a task parameter is suspected of changing the dynamics
-    friction_share: float = 0.5  # share of the left-out error of rates that dry friction must leave at most
-    kept_share: float = 2.0  # the same, of friction that was found before: single steps tell less of it than loops do
-    noise_share: float = 0.75  # largest share of the squares of these errors that counts as noise
     slow_loop: float = 0.02  # seconds of a closed loop on M from which on loops are distributed over the cores
     thinking: ThinkingSettings = field(default_factory=ThinkingSettings)
-    friction: FrictionSettings = field(default_factory=FrictionSettings)
-    actuators: ActuatorSettings = field(default_factory=ActuatorSettings)
+    structure: StructureSettings = field(default_factory=StructureSettings)
     regular: RegularSettings = field(default_factory=RegularSettings)
     noise: NoiseSettings = field(default_factory=NoiseSettings)
     agreement: AgreementSettings = field(default_factory=AgreementSettings)
@@ -72,8 +63,10 @@ class DynamicsStudy(ShortRepr):
         validation: the same with the states of M if only outputs are recorded, and with the physical task parameters
             as further states; everything is learned of these.
         quantile: the share of the executions of a task that a distance is about, if the system is noisy.
-        actuator: how the m inputs act; None if they act at once.
+        share: the share of the tasks whose distances are asked for; 1 for the largest one.
+        effects: effects of inputs, with their sizes; empty if commands act as they are.
         friction: M with the dry friction that it lacks, of which the residual is learned; None without.
+        with_data: whether the data that M was made from are learned from.
         settings: the numbers that decide what is learned.
     """
 
@@ -83,34 +76,62 @@ class DynamicsStudy(ShortRepr):
         seed: int = 0,
         quantile: float = QUANTILE,
         extended: ExtendedValidation | None = None,
-        friction: DryFriction | None = None,
         settings: LearningSettings | None = None,
+        *,
+        effects: Found = (),
+        friction: DryFriction | None = None,
+        with_data: bool = True,
+        share: float = 1.0,
     ) -> None:
-        self.settings = settings or LearningSettings()
-        self.given, self.seed, self.quantile, self.friction = validation, seed, quantile, friction
-        self.extended = ExtendedValidation(validation) if extended is None else extended
-        self.actuator, self.validation = self.extended.actuator, self.extended.validation
-        self.planner = LoopPlanner(self.validation)
+        self.settings, self.share = settings or LearningSettings(), share
+        self.given, self.seed, self.quantile = validation, seed, quantile
+        self.effects, self.friction, self.with_data = effects, friction, with_data
+        of_inputs = InputEffects(tuple(each.effect for each in effects))
+        self.extended = ExtendedValidation(validation, of_inputs) if extended is None else extended
+        self.validation = self.extended.validation
+        self.planner = LoopPlanner(self.validation, of_inputs)
         self._errors = ErrorVectors(self.planner if validation.outputs is None else LoopPlanner(validation))
         self._covariances = Latest[bytes, LearnedCovariances | None](8)
-        self._found: dict[bytes, str | None] = {}
-        self._others: dict[str, DynamicsStudy] = {}
-        self._actuators: dict[bytes, Actuator | None] = {}
-        self._actuated: DynamicsStudy | None = None
-        self._slowed: dict[bytes, DynamicsStudy | None] = {}
+        self._effects_of = Latest[bytes, Found](8)
+        self._made = Latest[tuple[object, ...], DynamicsStudy](8)
         self._searches: dict[float, WorstCaseSearch] = {}
         #: largest distances of tasks if M errs by so much in each step, of each error and task
         self.under_errors: dict[bytes, dict[bytes, float]] = {}
 
-    def fresh_copy(self, quantile: float | None = None) -> DynamicsStudy:
-        """Return a study of the same experiment that has learned nothing yet, with a quantile if it is given."""
+    def fresh_copy(self, quantile: float | None = None, share: float | None = None) -> DynamicsStudy:
+        """Return a study of the same experiment that has learned nothing yet, with what is given."""
         quantile = self.quantile if quantile is None else quantile
-        return DynamicsStudy(self.given, self.seed, quantile, settings=self.settings)
+        share = self.share if share is None else share
+        return DynamicsStudy(self.given, self.seed, quantile, settings=self.settings, share=share)
 
-    def _with(
-        self, given: Validation, extended: ExtendedValidation, friction: DryFriction | None = None
+    def made(
+        self,
+        *,
+        given: Validation | None = None,
+        effects: Found | None = None,
+        friction: DryFriction | None = None,
+        with_data: bool | None = None,
     ) -> DynamicsStudy:
-        return DynamicsStudy(given, self.seed, self.quantile, extended, friction, self.settings)
+        """Return a study with other parts; the others stay. The latest ones are kept."""
+        given, friction = given or self.given, friction or self.friction
+        kept = self.effects if effects is None else effects
+        with_data = self.with_data if with_data is None else with_data
+        if (given, kept, friction, with_data) == (self.given, self.effects, self.friction, self.with_data):
+            return self
+        key = tuple(given.physical), kept, friction, with_data
+        if key not in self._made:
+            same = self.extended if given is self.given else self.extended.of(given)
+            extended = same if effects is None else None
+            self._made[key] = DynamicsStudy(
+                given, self.seed, self.quantile, extended, self.settings,
+                effects=kept, friction=friction, with_data=with_data, share=self.share,
+            )  # fmt: skip
+        return self._made[key]
+
+    @functools.cached_property
+    def structures(self) -> StructureSearch:
+        """Finds what the dynamics of executions consist of."""
+        return StructureSearch(self, self.settings.structure)
 
     def state_of_parts(self) -> tuple[str, bytes]:
         """Return the description of M and the synthesizer, and some steps of M, which a description may not show."""
@@ -125,11 +146,13 @@ class DynamicsStudy(ShortRepr):
     def search(self) -> WorstCaseSearch:
         """Searches the tasks for the largest distance of each draw."""
         settings = WorstCaseSettings.for_dimension(self.validation.space.dimension, self.planner.batched)
+        if self.share < 1:
+            return ShareSearch(self.planner, self.seed, self.share, settings)
         return WorstCaseSearch(self.planner, self.seed, settings)
 
     def search_within(self, ledger: Ledger, replicates: int) -> WorstCaseSearch:
         """Return the search, of fewer tasks if the budget of a ledger does not allow all of them."""
-        if not ledger.is_limited:
+        if not ledger.is_limited or self.share < 1:  # fewer tasks tell nothing of a share of them
             return self.search
         shares = self.settings.thinking.shares if self.search.members is None else (1.0,)
         for share in shares:
@@ -183,53 +206,12 @@ class DynamicsStudy(ShortRepr):
         parametric = None if logged else self._parametric(extended, ledger)
         if parametric is not None:
             return parametric
-        learned, settings = self._learn(extended, logged, with_data=True, ledger=ledger), self.settings
+        learned = self._learn(extended, logged, ledger)
         ledger.charge("learning", lambda costs: costs.learning())
+        if learned is None or logged:
+            return learned
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
-            if learned is None or len(executed) < settings.actuator_from:
-                return learned
-            asks = not logged and self.friction is None
-            if asks and self.actuator is None and learned.left_out_error > settings.actuator_error:
-                asks = ledger.learns("learning", "inputs that act late", lambda costs: costs.actuators())
-            actuator = self._found_actuator(executed, learned) if asks else None
-            if actuator is not None:
-                if self._actuated is None or self._actuated.actuator != actuator:
-                    acting = ExtendedValidation(self.given, actuator, executed[0][1].inputs.shape[-1])
-                    self._actuated = self._with(self.given, acting)
-                return self._actuated.learn(executed, ledger=ledger) or learned
-            asks = not logged
-            if asks and self.friction is None and learned.left_out_error > settings.small_error:
-                asks = ledger.learns("learning", "dry friction", lambda costs: costs.friction())
-            held = self._with_friction(executed, learned, ledger) if asks else None
-            if held is not None:
-                return held
-            if not learned.left_out_error > settings.small_error:
-                return learned
-            has_data = bool((learned.posterior.data.sources == -1).any())
-            if has_data and ledger.learns("learning", "the data of M", lambda costs: costs.learning()):
-                without = self._learn(extended, logged, with_data=False, ledger=ledger)
-                clear = min(settings.small_error, learned.left_out_error / settings.clear_factor)
-                if without is not None and without.left_out_error < clear:
-                    learned = without
-            large = learned.left_out_error > settings.small_error
-            asks = not logged and len(executed) >= settings.parameter_from and large
-            names = len(self.given.space.units) + 1
-            stage = "parameters that change the dynamics"
-            if asks and ledger.learns("learning", stage, lambda costs: names * costs.learning()):
-                # A task parameter that explains the errors of predictions; asked in each doubling of the executions.
-                some = settings.parameter_from
-                while 2 * some <= len(executed):
-                    some *= 2
-                key = digest(trajectory for _, trajectory in executed[:some])
-                if key not in self._found:
-                    name, with_it, without_it = self._most_telling(executed[:some])
-                    # If errors remain, it may be a sign of noise, or of a state that is not recorded.
-                    clear = min(settings.small_error, without_it / settings.clear_factor)
-                    self._found[key] = name if with_it < clear else None
-                parameter = self._found[key]
-                learned = (
-                    learned if parameter is None else self._with_parameter(parameter).learn(executed, ledger=ledger)
-                )
+            return self.structures.best(executed, learned, ledger)
         return learned
 
     def _parametric(self, executed: Executed, ledger: Ledger) -> LearnedDynamics | None:
@@ -237,11 +219,18 @@ class DynamicsStudy(ShortRepr):
         model = uncertain_in(before_refinement(self.validation.model))
         if model is None or not executed or self.extended.needs_tasks or self.friction is not None:
             return None
-        loops, recorded = [trajectory for _, trajectory in executed], self._recorded(executed, (), with_data=False)
-        if recorded is None:
+        loops, on_model, settings = [trajectory for _, trajectory in executed], self.extended.loops, self.settings
+        if on_model is None:
             return None
-        seed = self.seed, len(executed), 0
-        posterior = learned_parameters(model, loops, recorded, seed, settings=self.settings.parametric)
+        candidates, count = self.input_candidates(loops, together=True), scheduled(len(loops))
+        key = digest(loops[:count])
+        posterior, seed = None, (self.seed, count, 0)
+        if key not in self._effects_of:
+            posterior = learned_parameters(model, loops[:count], on_model, seed, candidates, None, settings.parametric)
+            self._effects_of[key] = () if posterior is None else posterior.effects
+        if posterior is None or count < len(loops):
+            seed, known = (self.seed, len(loops), 0), self._effects_of[key]
+            posterior = learned_parameters(model, loops, on_model, seed, candidates, known, settings.parametric)
         if posterior is None:
             return None
         points = np.array([point for point, _ in executed])
@@ -251,7 +240,7 @@ class DynamicsStudy(ShortRepr):
         """Return what the regular transitions of executions teach; None if there are no irregular ones."""
         extended, model = self.extended.executions(executed), before_refinement(self.validation.model)
         for with_data in (True, False):
-            recorded = self._recorded(extended, (), with_data) if extended else None
+            recorded = self.transitions_of(extended, (), with_data) if extended else None
             if recorded is None or self.extended.loops is None or not extended:
                 return None
             settings, seed = PosteriorSettings.for_horizon(self.extended.loops.horizon), (self.seed, len(executed), 0)
@@ -265,9 +254,9 @@ class DynamicsStudy(ShortRepr):
         self, executed: Executed, logged: Sequence[Trajectory], recorded_as: Executed, allowed: float
     ) -> AgreeingDynamics | None:
         """Return M itself, with an error bound, if it explains all executions up to negligible errors."""
-        if not executed or self.friction is not None or self.actuator is not None:
+        if not executed or self.friction is not None or self.effects:
             return None  # M alone does not explain them
-        recorded = self._recorded(executed, logged, with_data=False)
+        recorded = self.transitions_of(executed, logged, with_data=False)
         if recorded is None:
             return None
         points, loops = np.array([point for point, _ in executed]), [loop for _, loop in executed]
@@ -278,17 +267,23 @@ class DynamicsStudy(ShortRepr):
             return agreeing
         return agreeing if allowed and agreeing.negligible <= allowed else None
 
+    def learned_alone(self, executed: Executed, ledger: Ledger | None = None) -> LearnedDynamics | None:
+        """Return what executions teach with the parts of this study; None if it is nothing."""
+        extended = self.extended.executions(executed)
+        return None if extended is None else self._learn(extended, (), ledger)
+
     def _learn(
-        self, executed: Executed, logged: Sequence[Trajectory], *, with_data: bool, ledger: Ledger | None = None
+        self, executed: Executed, logged: Sequence[Trajectory], ledger: Ledger | None = None
     ) -> LearnedDynamics | None:
-        recorded = self._recorded(executed, logged, with_data)
+        with_data = self.with_data
+        recorded = self.transitions_of(executed, logged, with_data)
         if recorded is None:
             return None
         # Hyperparameters are learned as scheduled, or now if nothing could be learned then; the latest ones are kept.
         for count in dict.fromkeys((scheduled(len(executed)), len(executed))):
-            key = digest([*(trajectory for _, trajectory in executed[:count]), *logged]) + bytes([with_data])
+            key = digest([*(trajectory for _, trajectory in executed[:count]), *logged])
             if key not in self._covariances:
-                some = recorded if count == len(executed) else self._recorded(executed[:count], logged, with_data)
+                some = recorded if count == len(executed) else self.transitions_of(executed[:count], logged, with_data)
                 if some is None or self.extended.loops is None:
                     continue
                 model, seed = self.friction or before_refinement(self.validation.model), (self.seed, count, 0)
@@ -309,7 +304,7 @@ class DynamicsStudy(ShortRepr):
         logged = () if self.extended.needs_tasks else logged
         if isinstance(learned, AgreeingDynamics):
             return self._agreeing(together, logged, executed, learned.allowed)
-        recorded = self._recorded(together, logged, learned.with_data)
+        recorded = self.transitions_of(together, logged, learned.with_data)
         covariances, ledger = learned.posterior.covariances, learned.ledger
         return self._conditioned(covariances, recorded, together, learned.with_data, ledger)
 
@@ -347,7 +342,7 @@ class DynamicsStudy(ShortRepr):
         kept = executed[:k] + executed[k + 1 :]
         if isinstance(learned, AgreeingDynamics):
             return self._agreeing(kept, (), kept, learned.allowed)
-        recorded = self._recorded(kept, (), learned.with_data)
+        recorded = self.transitions_of(kept, (), learned.with_data)
         others = self._conditioned(learned.posterior.covariances, recorded, kept, learned.with_data)
         if others is None:
             return None
@@ -365,123 +360,47 @@ class DynamicsStudy(ShortRepr):
         loops = self.extended.loops
         return None if loops is None else data_near(self.validation.model, loops)
 
-    def _recorded(
-        self, executed: Executed, logged: Sequence[Trajectory], with_data: bool
+    @property
+    def has_data(self) -> bool:
+        """Whether it learns from data that M was made from."""
+        return self.with_data and self._data is not None
+
+    def transitions_of(
+        self, executed: Executed, logged: Sequence[Trajectory] = (), with_data: bool = True
     ) -> tuple[Transitions, Rows] | None:
+        """Return the transitions of executions of the extended validation; None if no task can be planned."""
         if self.extended.loops is None:
             return None
         # The data that M was made from tell no earlier inputs.
-        data = self._data if with_data and self.actuator is None else None
-        loops = [replace(loop, inputs=self.extended.acting(loop)) for _, loop in executed]
+        data = self._data if with_data and not self.effects else None
+        loops = [loop for _, loop in executed]
         return recorded_transitions(self.validation.model, data, loops, self.extended.loops, logged)
 
-    def _with_parameter(self, name: str) -> DynamicsStudy:
-        if name not in self._others:
-            given = self.given.with_parts(physical=[*self.given.physical, name])
-            self._others[name] = self._with(given, self.extended.of(given))
-        return self._others[name]
+    def input_candidates(self, loops: Sequence[Trajectory], *, together: bool) -> Found:
+        """Return the effects that inputs may have in executions, alone or only those of all inputs ``together``."""
+        commands, times = np.concatenate([each.inputs for each in loops]), max((each.times for each in loops), key=len)
+        seconds = float(times[-1] - times[0])
+        dt, names = seconds / max(len(times) - 1, 1), self.input_names(commands.shape[1])
+        model = before_refinement(self.validation.model)
+        return input_candidates(model, dt, names, commands, seconds, together=together)
 
-    def _found_actuator(self, executed: Executed, learned: LearnedDynamics) -> Actuator | None:
-        """Return a delay and a lag of inputs that explain the errors of predictions; one that is found is refined."""
-        actuator = None
-        counts = schedule(self.settings.actuator_from, len(executed)) if self.actuator is None else ()
-        for some in (executed[:count] for count in counts):
-            key = digest(trajectory for _, trajectory in some)
-            if key not in self._actuators:
-                self._actuators[key] = None  # also if its search fails
-                known: LearnedDynamics | None = learned
-                if actuator is None and len(some) < len(executed):
-                    known = self._learned_alone(some, with_data=True)
-                if actuator is not None or (known is not None and known.left_out_error > self.settings.actuator_error):
-                    self._actuators[key] = self._search_actuator(some, actuator)
-            actuator = self._actuators[key]
-        return actuator
+    def input_names(self, inputs: int) -> list[tuple[str, str]]:
+        """Return the names and units of the m inputs."""
+        return list(self.validation.names(0, inputs)[1].items())
 
-    def _search_actuator(self, executed: Executed, before: Actuator | None) -> Actuator | None:
-        estimated = self.given.outputs is not None
-        # Estimates of states cost as much as hundreds of steps, so the latest few executions have to suffice.
-        among = executed[-5:] if estimated else executed
-        commanded = [trajectory.inputs for _, trajectory in among]
-        alike = len({u.shape for u in commanded}) == 1
-
-        def with_inputs(actuator: Actuator) -> list[Record]:
-            acting = actuator.acting(np.stack(commanded)) if alike else map(actuator.acting, commanded)
-            return [replace(record, inputs=u) for record, u in zip(plain, acting, strict=True)]
-
-        def estimated_with(actuator: Actuator) -> list[Record]:
-            extended = ExtendedValidation(self.given, actuator, commanded[0].shape[-1])
-            known = extended.executions(among, len(among))
-            if known is None:
-                raise np.linalg.LinAlgError
-            return extended.records(known)
-
-        # If states are recorded, they are the same with every actuator.
-        plain = [] if estimated else estimated_with(Actuator())
-        model, records_of = before_refinement(self.validation.model), estimated_with if estimated else with_inputs
-        with single_threaded(), np.errstate(all="ignore"):
-            return found_actuator(model, records_of, before, 30 if estimated else 80, self.settings.actuators)
-
-    def _with_friction(self, executed: Executed, learned: LearnedDynamics, ledger: Ledger) -> LearnedDynamics | None:
-        """Return what executions teach beside the dry friction that scheduled ones show; None if they show none.
-
-        Without friction, predictions of left-out executions must have erred once, and at least twice as much in rates.
-        """
-        if self.friction is not None or self.given.outputs is not None:
-            return None
-        study, settings = None, self.settings
-        for some in (executed[:count] for count in schedule(settings.friction_from, len(executed))):
-            key = digest(trajectory for _, trajectory in some)
-            if key not in self._slowed:
-                self._slowed[key] = study  # also if its search fails
-                without = learned if len(some) == len(executed) else self._learned_alone(some, with_data=True)
-                if without is not None and (study is not None or without.left_out_error > settings.small_error):
-                    tried = self._friction_study(some)
-                    share = settings.friction_share
-                    if tried and (study is not None or _error_of_rates(tried.learn(some), without) < share):
-                        self._slowed[key] = tried
-            study = self._slowed[key]
-        held = None if study is None else study.learn(executed, ledger=ledger)
-        return held if _error_of_rates(held, learned) < settings.kept_share else None
-
-    def _friction_study(self, executed: Executed) -> DynamicsStudy | None:
-        """Return a study of M with the dry friction that executions show; None if they show none."""
-        extended, model = self.extended.executions(executed), before_refinement(self.validation.model)
-        recorded = self._recorded(extended, (), with_data=False) if extended else None
-        friction, settings = None, self.settings.friction
-        with single_threaded(), np.errstate(all="ignore"), contextlib.suppress(RuntimeError):  # of the least squares
-            friction = None if recorded is None else found_friction(model, recorded[0], settings)
-        if friction is None:
-            return None
-        return self._with(self.given, self.extended, friction)
-
-    def _most_telling(self, executed: Executed) -> tuple[str | None, float, float]:
-        """Return the task parameter with which predictions err least, and the left-out errors with it and without."""
-        name, least = None, np.inf  # the data that M was made from tell no parameters
-        for other in self.given.space.units:
-            if other not in self.given.physical:
-                study = self._with_parameter(other)
-                learned = study._learned_alone(executed, with_data=False)
-                if learned is not None and learned.left_out_error < least:
-                    name, least = other, learned.left_out_error
-        without_it = self._learned_alone(executed, with_data=False)
-        return name, least, 0.0 if without_it is None else without_it.left_out_error
-
-    def _learned_alone(self, executed: Executed, *, with_data: bool) -> LearnedDynamics | None:
-        extended = self.extended.executions(executed)
-        return None if extended is None else self._learn(extended, (), with_data=with_data)
-
-    def suspected_parameter(self, learned: LearnedDynamics) -> tuple[str, float] | None:
+    def suspected_parameter(self, learned: LearnedDynamics, executed: Executed) -> tuple[str, float] | None:
         """Return the task parameter that the dynamics depend on most clearly, and how many times less predictions err.
 
-        Each execution is predicted from the others, with the parameter as a state and without it. It is None if there
-        are too few executions, or if no parameter halves the error.
+        Each of the given executions is predicted from the others, with the parameter as a state and without it. Returns
+        None if there are too few executions, or if no parameter halves the error.
         """
-        settings = self.settings
-        if len(learned.executed) < settings.parameter_from or not learned.left_out_error > settings.small_error:
+        first, error, _ = self.settings.structure.parameter
+        if len(executed) < first or not learned.left_out_error > error:
             return None
-        plain = [(point, self.extended.recorded(trajectory)) for point, trajectory in learned.executions]
-        name, with_it, without_it = self._most_telling(plain)
-        return None if name is None or with_it > without_it / 2 else (name, without_it / max(with_it, 1e-300))
+        found, with_it, without_it = most_telling(self, executed)
+        if found is None or with_it > without_it / 2:
+            return None
+        return found.given.physical[-1], without_it / max(with_it, 1e-300)
 
     def prediction_of(self, learned: LearnedDynamics | None, executed: Executed) -> Prediction | None:
         """Return the distances that executions, and what was learned from them, predict; None if nothing is known.
@@ -510,18 +429,3 @@ class DynamicsStudy(ShortRepr):
         if vectors is None or not isinstance(distance, ComposedDistance):
             return None
         return predict_composed(np.array([point for point, _ in executed]), vectors, distance.compose)
-
-
-def _error_of_rates(held: LearnedDynamics | None, without: LearnedDynamics) -> float:
-    """Return the left-out error of the rates that friction slows, as a share of that without it; infinity for None.
-
-    What the Gaussian processes take for noise is no part of them. Where a joint stops within a step changes
-    its position a little, which nothing predicts.
-    """
-    if held is None or held.study.friction is None:
-        return np.inf
-    rates = held.study.friction.rates
-    noise = (held.posterior.deviations[rates] / np.maximum(held.model_errors[rates], 1e-300)) ** 2
-    squares, squares_without = (float((each.left_out_errors[rates] ** 2).sum()) for each in (held, without))
-    noise_alone = min(float(noise.sum()), held.study.settings.noise_share * min(squares, squares_without))
-    return float(np.sqrt((squares - noise_alone) / max(squares_without - noise_alone, 1e-300)))

@@ -1,8 +1,8 @@
-"""The validation of which dynamics are learned: states of M for outputs, parameters as states, inputs that act late.
+"""The validation of which dynamics are learned: states of M for outputs, parameters as states, inputs that act.
 
 What M misses must be a function of state and input. Task parameters may change the dynamics, as a payload does: each of
-these becomes a state that does not change. If inputs act late, a closed loop has the acting inputs and those that were
-commanded, in this order. So everything that is learned, covered and tested of states and inputs holds. M, the
+these becomes a state that does not change. If inputs have effects, such as a delay, executions have the inputs that act
+in the place of commands. So everything that is learned, covered and tested of states and inputs holds. M, the
 controllers and the distance are the user's, and see a closed loop as the system records it.
 """
 
@@ -28,12 +28,11 @@ from ctxval.core.system import Outputs
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.actuators import ActuatedController
+from ctxval.learning.effects.inputs import NO_EFFECTS, InputEffects
 from ctxval.learning.histories import Record
 from ctxval.learning.prediction import Executed
 from ctxval.learning.recorded import closed_loops_on_model, scheduled
 from ctxval.learning.state_estimates import StateEstimates
-from ctxval.systems.actuator import Actuator
 
 
 def with_states_of_model(validation: Validation) -> Validation:
@@ -51,24 +50,23 @@ def estimates_by_loops_on_model(validation: Validation) -> StateEstimates | None
 class ExtendedValidation:
     """A user's validation, which is given, and the one whose trajectories what S does in a step is a function of.
 
-    The system of the other ``validation`` cannot be executed. If nothing is extended, it is the given one. The number
-    of inputs need not be known without an actuator.
+    The system of the other ``validation`` cannot be executed. If nothing is extended, it is the given one.
     """
 
     def __init__(
         self,
         given: Validation,
-        actuator: Actuator | None = None,
-        inputs: int = 0,
+        effects: InputEffects = NO_EFFECTS,
         estimates: StateEstimates | None = None,
     ) -> None:
-        self.given, self.actuator, self.inputs, self._known = given, actuator, inputs, estimates
+        self.given, self.effects, self._known = given, effects, estimates
         self._acting = WeakKeyDictionary[Trajectory, Trajectory]()
         of_names = (np.arange(given.space.dimension)[given.space.columns(name)] for name in given.physical)
         self._columns = np.hstack([np.empty(0, dtype=np.intp), *of_names])
         # Whether only executions of tasks can be learned from: other recordings tell no parameters and no start.
-        self.needs_tasks = bool(given.physical) or given.outputs is not None or actuator is not None
-        self.validation = self._extended() if self.needs_tasks else given
+        changes = bool(given.physical) or given.outputs is not None
+        self.needs_tasks = changes or bool(effects.effects)
+        self.validation = self._extended() if changes else given
 
     def _extended(self) -> Validation:
         given, columns, k = self.given, self._columns, len(self._columns)
@@ -78,12 +76,12 @@ class ExtendedValidation:
             return _ExtendedTask(plain, parameters.points[..., columns]) if k else plain
 
         # If only outputs are recorded, M is that of the user, and controllers are designed on the model that is given.
-        model = _ExtendedModel(given.model, k, self.inputs) if k or self.actuator else None
+        model = _ExtendedModel(given.model, k) if k else None
         designed_on = None if model is None else given.model
         return given.with_parts(
             task=task,
             model=model or given.model,
-            synthesizer=_ExtendedSynthesizer(given.synthesizer, designed_on, given.outputs, k, self.actuator),
+            synthesizer=_ExtendedSynthesizer(given.synthesizer, designed_on, given.outputs, k),
             distance=_ExtendedDistance(given.distance, self.recorded),
             labels=self._labels(),
             outputs=None,
@@ -125,7 +123,7 @@ class ExtendedValidation:
     def pairs(self) -> Array:
         """Some states and acting inputs of the closed loops on M, shape ``(V, n + m)``."""
         assert self.loops is not None
-        pairs = np.concatenate([self.loops.states[..., :-1, :], self.acting(self.loops)], axis=-1)
+        pairs = np.concatenate([self.loops.states[..., :-1, :], self.effects.acting(self.loops.inputs)], axis=-1)
         pairs = pairs.reshape(-1, pairs.shape[-1])
         pairs = pairs[np.isfinite(pairs).all(axis=1)]
         return np.asarray(pairs[:: max(1, len(pairs) // 600)])
@@ -134,30 +132,27 @@ class ExtendedValidation:
         """Return executions of the other validation; None without states, estimated as in the first ``some``."""
         some = scheduled(len(executed)) if some is None else some
         acting = list(executed)
-        if self.actuator is not None:  # with the inputs that act alone, the same object each time
+        if self.effects.effects:  # the same object each time
             for _, trajectory in executed:
                 if trajectory not in self._acting:
-                    self._acting[trajectory] = replace(trajectory, inputs=self.actuator.acting(trajectory.inputs))
+                    self._acting[trajectory] = replace(trajectory, inputs=self.effects.acting(trajectory.inputs))
             acting = [(point, self._acting[trajectory]) for point, trajectory in executed]
         if self.given.outputs is not None:
             states = None if self.estimates is None else self.estimates.of(acting, some)
             if states is None:
                 return None
             acting = [(point, trajectory) for (point, _), trajectory in zip(acting, states, strict=True)]
-        together = []
-        for (point, trajectory), (_, whole) in zip(acting, executed, strict=True):
-            if len(self._columns):
-                values = self.given.space.from_unit(point)[self._columns]
-                trajectory = replace(trajectory, states=_joined(trajectory.states, values))
-            if self.actuator is not None:
-                commanded = whole.inputs[..., : trajectory.inputs.shape[-2], :]
-                trajectory = replace(trajectory, inputs=np.concatenate([trajectory.inputs, commanded], axis=-1))
-            together.append((point, trajectory))
-        return together
+        if not len(self._columns):
+            return acting
+        values = [self.given.space.from_unit(point)[self._columns] for point, _ in acting]
+        return [
+            (point, replace(trajectory, states=_joined(trajectory.states, each)))
+            for (point, trajectory), each in zip(acting, values, strict=True)
+        ]
 
     def of(self, given: Validation) -> ExtendedValidation:
         """Return the same with other physical parameters; the states of M along executions are the same."""
-        return ExtendedValidation(given, self.actuator, self.inputs, self.estimates)
+        return ExtendedValidation(given, self.effects, self.estimates)
 
     @functools.cached_property
     def estimates(self) -> StateEstimates | None:
@@ -168,16 +163,10 @@ class ExtendedValidation:
         return StateEstimates(self.given, self.given.outputs, states)
 
     def recorded(self, trajectory: Trajectory) -> Trajectory:
-        """Return a closed loop as the system records it."""
+        """Return a closed loop, with the inputs that are commanded, as the system records it."""
         if len(self._columns):
             trajectory = replace(trajectory, states=trajectory.states[..., : -len(self._columns)])
-        if self.actuator is not None:
-            trajectory = replace(trajectory, inputs=trajectory.inputs[..., -self.inputs :])
         return trajectory if self.given.outputs is None else self.given.outputs.of(trajectory)
-
-    def acting(self, trajectory: Trajectory) -> Array:
-        """Return the inputs of a closed loop that act."""
-        return trajectory.inputs if self.actuator is None else trajectory.inputs[..., : self.inputs]
 
     def records(self, executed: Executed) -> list[Record]:
         """Return executions of the other validation with the inputs that act, and the initial states of their tasks."""
@@ -185,7 +174,7 @@ class ExtendedValidation:
         for point, trajectory in executed:
             task = self.validation.task(space.parameters(space.from_unit(point)))
             start = np.asarray(task.initial_state, dtype=np.float64)
-            records.append(Record(trajectory.states, self.acting(trajectory), start))
+            records.append(Record(trajectory.states, trajectory.inputs, start))
         return records
 
 
@@ -220,35 +209,32 @@ def _plain(task: Task) -> Task:
 
 @dataclass(frozen=True)
 class _ExtendedModel:
-    """M, beside k states that stay as they are, under the last m inputs, which are commanded, or under all if m = 0."""
+    """M, beside k states that stay as they are."""
 
     model: Model
     k: int
-    inputs: int
 
     def step(self, x: Array, u: Array) -> Array:
         n = x.shape[-1] - self.k
-        following = np.asarray(self.model.step(x[..., :n], u[..., -self.inputs :]))
-        return _joined(following, x[..., n:]) if self.k else following
+        return _joined(np.asarray(self.model.step(x[..., :n], u)), x[..., n:])
 
     def start(self, x: Array) -> Array:
         return memory_in(self.model, x[..., : x.shape[-1] - self.k])
 
     def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
         n = x.shape[-1] - self.k
-        following, memory = advanced(self.model, x[..., :n], u[..., -self.inputs :], memory)
-        return (_joined(following, x[..., n:]) if self.k else following), memory
+        following, memory = advanced(self.model, x[..., :n], u, memory)
+        return _joined(following, x[..., n:]), memory
 
 
 @dataclass(frozen=True)
 class _ExtendedSynthesizer:
-    """Designs the user's controllers, on this model if it is given; they see what is recorded and may act late."""
+    """Designs the user's controllers, on this model if it is given; they see what is recorded."""
 
     synthesizer: Synthesizer
     model: Model | None
     outputs: Outputs | None
     k: int
-    actuator: Actuator | None
 
     @property
     def batched(self) -> bool:
@@ -257,8 +243,7 @@ class _ExtendedSynthesizer:
     def design(self, task: Task, model: Model) -> Controller:
         designed = self.synthesizer.design(_plain(task), model if self.model is None else self.model)
         controller = designed if self.outputs is None else self.outputs.seen_by(designed)
-        controller = seeing(controller, lambda x: x[..., : -self.k], _plain) if self.k else controller
-        return controller if self.actuator is None else ActuatedController(controller, self.actuator)
+        return seeing(controller, lambda x: x[..., : -self.k], _plain) if self.k else controller
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from ctxval.learning.coverage import (
 )
 from ctxval.learning.draws import Draws, DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
+from ctxval.learning.effects.inputs import labelled_sizes
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.regular import Boundary, RegularTransitions
@@ -276,6 +277,11 @@ class LearnedDynamics(ShortRepr):
             f"{letter}[{i}]" if twice or label == f"{letter}{i}" else label
             for (letter, i), label in zip(coordinates, labels, strict=True)
         )
+
+    @property
+    def acting(self) -> dict[str, float]:
+        """The sizes of effects of inputs by their labels; empty if commands act as they are."""
+        return labelled_sizes(self.study.effects, self.study.input_names(self.posterior.data.inputs))
 
     @property
     def friction(self) -> dict[str, float]:

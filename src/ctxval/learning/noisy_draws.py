@@ -159,7 +159,7 @@ class NoisyRuns:
     def step(self, x: Array, u: Array) -> Array:
         """Return the next records, shapes ``(..., n), (..., m) -> (..., n)``."""
         fit, memory = self._fit, self._memory
-        flat = u.reshape(math.prod(u.shape[:-1]), u.shape[-1])[:, : fit.scaled.inputs]  # those that act
+        flat = u.reshape(math.prod(u.shape[:-1]), u.shape[-1])
         with np.errstate(all="ignore"):
             z = (fit.history.regressors(memory, flat) - fit.scaled.shift) / fit.scaled.scale
             z = np.clip(np.nan_to_num(z, nan=0.0, posinf=1e3, neginf=-1e3), -1e3, 1e3)

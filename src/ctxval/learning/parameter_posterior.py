@@ -13,15 +13,19 @@ mode is found by Gauss-Newton steps, and draws come from population Monte Carlo 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model, advanced, with_memory
+from ctxval.core.state_geometry import PLAIN, StateGeometry, geometry_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.uncertain import UncertainModel
+from ctxval.learning.effects.effect import EffectCandidate
+from ctxval.learning.effects.model import ModelWithEffects
+from ctxval.learning.effects.uncertain import UncertainEffects
 
 
 @dataclass(frozen=True)
@@ -41,58 +45,71 @@ class ParameterSettings:
     wider: float = 1.6  # factor of the covariance of the proposal
     proposal_tails: float = 6.0  # degrees of freedom of the proposal
     jitter: float = 0.2  # of draws around samples, in standard deviations
+    effects: int = 2  # of inputs, such as a delay, at most
+    explained: float = 0.05  # error of segments that is left, as a share of M's, below which no effects are looked for
+    screened: int = 2  # Gauss-Newton steps with each of the effects that are tried
+    price: float = 10.0  # by which an effect must raise the log posterior, beside the price of its size
 
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """N pieces of L steps of executions, and the transitions of all steps."""
+    """N pieces of L steps of executions, with all commands of E executions, because effects of inputs remember them."""
 
     states: Array  # at the start, (N, n)
     memory: Array  # of the model there, (N, k)
-    inputs: Array  # (N, L, m)
+    commands: Array  # 0 after the end of an execution, (E, H, m)
+    execution: Rows  # (N,)
+    first: Rows  # the step that each begins with, (N,)
     reached: Array  # recorded states after each step, (N, L, n)
     scale: Array  # of the errors of each state, (n,)
+    missed: Array  # mean squared errors of M, (N,)
+    geometry: StateGeometry = PLAIN
 
     @classmethod
     def of(
         cls, model: Model, executed: Sequence[Trajectory], rng: np.random.Generator, settings: ParameterSettings
     ) -> Segments | None:
         """Return segments of executions; None if no step of a segment is finite."""
-        parts = []
-        for trajectory in executed:
-            steps, L = with_memory(model, trajectory), min(settings.steps, trajectory.horizon)
+        L, horizon = (limit([settings.steps, *(run.horizon for run in executed)]) for limit in (min, max))
+        parts, commands = [], []
+        for k, trajectory in enumerate(executed):
+            steps = with_memory(model, trajectory)
             memory = np.empty((len(steps), 0)) if steps.memory is None else steps.memory
+            commands.append(np.pad(steps.u, ((0, horizon - len(steps)), (0, 0))))
             for first in range(0, trajectory.horizon - L + 1, L):
-                some = slice(first, first + L)
-                parts.append((steps.x[first], memory[first], steps.u[some], steps.x_next[some]))
+                parts.append((steps.x[first], memory[first], k, first, steps.x_next[first : first + L]))
         if len(parts) > settings.segments:
             parts = [parts[k] for k in np.sort(rng.permutation(len(parts))[: settings.segments])]
-        if not parts or len({part[2].shape for part in parts}) > 1:
-            return None
-        states, memory, inputs, reached = map(np.stack, zip(*parts, strict=True))
-        segments = cls(states, memory, inputs, reached, np.ones(states.shape[1]))
+        states, memory, execution, begins, reached = (np.array(each) for each in zip(*parts, strict=True))
+        units = np.ones(states.shape[1]), np.ones(len(states)), geometry_of(model)
+        segments = cls(states, memory, np.stack(commands), execution, begins, reached, *units)
         errors = segments.errors(model)[0]
         finite = np.isfinite(errors).all(axis=(1, 2))
         if not finite.any():
             return None
         sizes = np.sqrt((errors[finite] ** 2).mean(axis=(0, 1)))
-        changes = np.sqrt(((reached[:, 0] - states) ** 2).mean(axis=0))
+        changes = np.sqrt((segments.geometry.difference(reached[:, 0], states) ** 2).mean(axis=0))
         # Chatter of numbers in a state that M predicts far better than others is no error that parameters explain.
         relative = np.divide(sizes, changes, out=np.zeros_like(sizes), where=changes > 0)
         scale = np.maximum(sizes, settings.chatter * relative.max(initial=0.0) * changes)
-        return cls(states, memory, inputs, reached, np.maximum(scale, 1e-12 + 1e-9 * np.abs(reached).max(axis=(0, 1))))
+        scale = np.maximum(scale, 1e-12 + 1e-9 * np.abs(reached).max(axis=(0, 1)))
+        missed = np.nan_to_num(((errors / scale) ** 2).mean(axis=(1, 2)), nan=1e6)
+        return replace(segments, scale=scale, missed=missed)
 
     def errors(self, model: Model, draws: int = 1) -> Array:
         """Return the errors ``(S, N, L, n)`` in units of the scale of a model, or of models of so many draws."""
 
         def of_draws(part: Array) -> Array:
-            return np.repeat(part[None], draws, axis=0)
+            return np.broadcast_to(part, (draws, *part.shape))
 
-        x, memory, errors = of_draws(self.states), of_draws(self.memory), []
+        x, memory, commands, errors = *map(of_draws, (self.states, self.memory, self.commands)), []
         with np.errstate(all="ignore"):
-            for step in range(self.inputs.shape[1]):
-                x, memory = advanced(model, x, of_draws(self.inputs[:, step]), memory)
-                errors.append((x - self.reached[:, step]) / self.scale)
+            if isinstance(model, ModelWithEffects):
+                commands, model = model.acting(commands), model.mechanics
+            for step in range(self.reached.shape[1]):
+                acting = commands[:, self.execution, self.first + step]
+                x, memory = advanced(model, np.array(x), acting, np.array(memory))
+                errors.append(self.geometry.difference(x, self.reached[:, step]) / self.scale)
         return np.stack(errors, axis=2)
 
 
@@ -116,70 +133,139 @@ class ParameterPosterior(ShortRepr):
         return np.asarray(self.samples[rows] + self.settings.jitter * moves)
 
 
-def parameter_posterior(
-    model: UncertainModel,
-    segments: Segments,
-    rng: np.random.Generator,
-    settings: ParameterSettings = ParameterSettings(),
-) -> ParameterPosterior:
-    """Return the posterior of standardised parameters given segments of executions."""
-    K = len(model.uncertain)
+@dataclass(frozen=True, eq=False)
+class ParameterMode(ShortRepr):
+    """The most probable standardised parameters, given segments of executions."""
 
-    def squares(z: Array) -> Array:
+    model: UncertainModel
+    segments: Segments
+    settings: ParameterSettings
+    z: Array  # (K,)
+    precision: Array  # (K, K)
+    variance: Array | float  # of the errors of usual segments
+    here: Array  # mean squared errors of segments, (N,)
+
+    @classmethod
+    def of(
+        cls,
+        model: UncertainModel,
+        segments: Segments,
+        settings: ParameterSettings,
+        begun: Array | None = None,
+        steps: int | None = None,
+    ) -> ParameterMode:
+        """Return the mode by Gauss-Newton steps, from standardised parameters that are ``begun`` with."""
+        K = len(model.uncertain)
+        mode = cls(model, segments, settings, np.zeros(K) if begun is None else begun, np.eye(K), 1.0, np.empty(0))
+        z, here = mode.z, mode.squares(mode.z[None])[0]
+        precision = np.eye(K)
+        for _ in range(settings.newton if steps is None else steps):
+            h = settings.difference * np.eye(K)
+            errors = segments.errors(model.drawn(np.concatenate([z + h, z - h, z[None]])), 2 * K + 1)
+            errors = np.nan_to_num(errors, nan=1e3, posinf=1e3, neginf=-1e3).reshape(2 * K + 1, len(here), -1)
+            slopes = (errors[:K] - errors[K : 2 * K]) / (2 * settings.difference)
+            variance = mode.usual(here)
+            robust = (settings.tails + 1) / (settings.tails + here / variance) / (variance * errors.shape[2])
+            weighted = slopes * robust[:, None]
+            precision = np.einsum("ise,jse->ij", weighted, slopes) + np.eye(K)
+            gradient = np.einsum("ise,se->i", weighted, errors[-1]) + z
+            step = np.clip(-np.linalg.solve(precision, gradient), -settings.longest, settings.longest)
+            tried = z + np.array([1.0, 0.5, 0.2, 0.05])[:, None] * step
+            of_tried = mode.squares(tried)
+            costs, before = mode.surprise(of_tried, tried, variance), float(mode.surprise(here, z, variance))
+            if not costs.min() < before - 1e-3:
+                break
+            best = int(costs.argmin())
+            z, here = tried[best], of_tried[best]
+            if np.abs(step).max() < 1e-3:
+                break
+        return replace(mode, z=z, precision=precision, variance=mode.usual(here), here=here)
+
+    def squares(self, z: Array) -> Array:
         """Return the mean squared errors ``(S, N)`` of segments; 1e6 where a run of the model fails."""
-        errors = segments.errors(model.drawn(z), len(z))
+        errors = self.segments.errors(self.model.drawn(z), len(z))
         return np.asarray(np.nan_to_num((errors**2).mean(axis=(2, 3)), nan=1e6, posinf=1e6).clip(max=1e6))
 
-    def surprise(of_segments: Array, z: Array, variance: float) -> Array:
-        """Return minus the log posterior ``(S,)`` of parameters ``(S, K)``."""
-        nu = settings.tails
+    def surprise(self, of_segments: Array, z: Array, variance: Array | float) -> Array:
+        """Return minus the log posterior ``(S,)`` of parameters ``(S, K)``, for a variance of errors."""
+        nu = self.settings.tails
         misfit = 0.5 * (nu + 1) * np.log1p(of_segments / (nu * variance)).sum(axis=-1)
         return np.asarray(misfit + 0.5 * (z**2).sum(axis=-1))
 
-    def usual(of_segments: Array) -> float:
+    def usual(self, of_segments: Array) -> float:
         """Return the variance of errors that a Student likelihood has with its usual segments."""
-        return max(float(np.median(of_segments)) / 0.8, settings.floor**2)
+        return max(float(np.median(of_segments)) / 0.8, self.settings.floor**2)
 
-    z, precision = np.zeros(K), np.eye(K)
-    of_model = here = squares(z[None])[0]
-    for _ in range(settings.newton):
-        h = settings.difference * np.eye(K)
-        errors = segments.errors(model.drawn(np.concatenate([z + h, z - h, z[None]])), 2 * K + 1)
-        errors = np.nan_to_num(errors, nan=1e3, posinf=1e3, neginf=-1e3).reshape(2 * K + 1, len(here), -1)
-        slopes = (errors[:K] - errors[K : 2 * K]) / (2 * settings.difference)
-        variance = usual(here)
-        robust = (settings.tails + 1) / (settings.tails + here / variance) / (variance * errors.shape[2])
-        weighted = slopes * robust[:, None]
-        precision = np.einsum("ise,jse->ij", weighted, slopes) + np.eye(K)
-        gradient = np.einsum("ise,se->i", weighted, errors[-1]) + z
-        step = np.clip(-np.linalg.solve(precision, gradient), -settings.longest, settings.longest)
-        tried = z + np.array([1.0, 0.5, 0.2, 0.05])[:, None] * step
-        of_tried = squares(tried)
-        costs, before = surprise(of_tried, tried, variance), float(surprise(here, z, variance))
-        if not costs.min() < before - 1e-3:
+    @property
+    def height(self) -> float:
+        """The log posterior at the mode, with the variance that segments have there."""
+        return -float(self.surprise(self.here, self.z, self.variance)) - 0.5 * len(self.here) * float(
+            np.log(self.variance)
+        )
+
+    @property
+    def left(self) -> float:
+        """The mean square of the errors of segments in shares of M's, outliers limited."""
+        of_model = np.minimum(self.segments.missed, 10.0).mean()
+        return float(np.minimum(self.here, 10.0).mean() / max(of_model, 1e-300))
+
+    def posterior(self, rng: np.random.Generator) -> ParameterPosterior:
+        """Return samples around the mode by population Monte Carlo."""
+        settings, K = self.settings, len(self.z)
+        mean, covariance = self.z, np.asarray(np.linalg.inv(self.precision), dtype=np.float64)
+        samples, weights = self.z[None], np.ones(1)
+        for _ in range(settings.rounds):
+            nu = settings.proposal_tails
+            root = np.linalg.cholesky(settings.wider * covariance + 1e-12 * np.eye(K))
+            normal = rng.standard_normal((settings.samples, K))
+            moves = normal / np.sqrt(rng.chisquare(nu, (settings.samples, 1)) / nu)
+            samples = mean + moves @ root.T
+            samples[0], moves[0] = mean, 0.0
+            of_proposal = -0.5 * (nu + K) * np.log1p((moves**2).sum(axis=1) / nu)
+            logs = -self.surprise(self.squares(samples), samples, self.variance) - of_proposal
+            weights = np.exp(logs - logs.max())
+            weights /= weights.sum()
+            mean = weights @ samples
+            spread = samples - mean
+            covariance = (spread * weights[:, None]).T @ spread + 0.1 * covariance
+        at_mean = replace(self, here=self.squares(mean[None])[0])
+        return ParameterPosterior(self.model, mean, covariance, samples, weights, at_mean.left, settings)
+
+
+def most_probable_effects(
+    mode: ParameterMode, candidates: Sequence[EffectCandidate], known: Sequence[EffectCandidate] | None = None
+) -> ParameterMode:
+    """Return the mode of a model with the effects of inputs that make executions clearly more probable.
+
+    The effects are looked for greedily, or are the ``known`` ones, whose sizes are fitted again.
+    """
+    settings, model, inputs = mode.settings, mode.model, mode.segments.commands.shape[2]
+
+    def with_effects(
+        effects: tuple[EffectCandidate, ...], begun: ParameterMode, steps: int | None = None
+    ) -> ParameterMode:
+        extended = UncertainEffects(model, effects, inputs)
+        z = np.append(begun.z, np.zeros(len(extended.uncertain) - len(begun.z)))
+        return ParameterMode.of(extended, mode.segments, settings, z, steps)
+
+    if known is not None:
+        return with_effects(tuple(known), mode) if known else mode
+    best, found = mode, tuple[EffectCandidate, ...]()
+    while len(found) < settings.effects and best.left > settings.explained**2:
+        tried = [
+            (*found, replace(each, effect=each.effect.with_sizes(start)))
+            for each in candidates
+            if each.effect.kind not in [other.effect.kind for other in found]
+            for start in each.starts
+        ]
+        if not tried:
             break
-        best = int(costs.argmin())
-        z, here = tried[best], of_tried[best]
-        if np.abs(step).max() < 1e-3:
+        few = max((with_effects(each, best, settings.screened) for each in tried), key=lambda each: each.height)
+        longer = ParameterMode.of(few.model, mode.segments, settings, few.z)
+        if longer.height < best.height + settings.price + 0.5 * np.log(len(mode.here)):
             break
-    variance = usual(here)
-    mean, covariance = z, np.linalg.inv(precision)
-    samples, weights = z[None], np.ones(1)
-    for _ in range(settings.rounds):
-        nu = settings.proposal_tails
-        root = np.linalg.cholesky(settings.wider * covariance + 1e-12 * np.eye(K))
-        normal = rng.standard_normal((settings.samples, K))
-        moves = normal / np.sqrt(rng.chisquare(nu, (settings.samples, 1)) / nu)
-        samples = mean + moves @ root.T
-        samples[0], moves[0] = mean, 0.0
-        logs = -surprise(squares(samples), samples, variance) + 0.5 * (nu + K) * np.log1p((moves**2).sum(axis=1) / nu)
-        weights = np.exp(logs - logs.max())
-        weights /= weights.sum()
-        mean = weights @ samples
-        spread = samples - mean
-        covariance = (spread * weights[:, None]).T @ spread + 0.1 * covariance
-    left = float(np.minimum(squares(mean[None])[0], 10.0).mean() / max(np.minimum(of_model, 10.0).mean(), 1e-300))
-    return ParameterPosterior(model, mean, np.asarray(covariance, dtype=np.float64), samples, weights, left, settings)
+        best, found = longer, (few.model.effects if isinstance(few.model, UncertainEffects) else found)
+    return best
 
 
 def blocks_of(lengths: Sequence[int], count: int, horizon: int, block: int, rng: np.random.Generator) -> Rows:

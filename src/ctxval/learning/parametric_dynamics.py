@@ -8,6 +8,7 @@ state is learned only if it predicts left-out executions, so that nothing that i
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
@@ -17,20 +18,25 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model, advanced, memory_in, predicted_steps, with_memory
-from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.core.state_geometry import PLAIN, StateGeometry, geometry_of
+from ctxval.core.trajectory import Trajectory
 from ctxval.core.uncertain import UncertainModel
 from ctxval.learning.draws import DrawsWithoutNoise
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
+from ctxval.learning.effects.uncertain import UncertainEffects
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
+from ctxval.learning.input_effects import Found
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.parameter_posterior import (
+    ParameterMode,
     ParameterPosterior,
     ParameterSettings,
     Segments,
     blocks_of,
-    parameter_posterior,
+    most_probable_effects,
 )
 from ctxval.learning.precision import agreeing_posterior
+from ctxval.learning.recorded import recorded_transitions
 from ctxval.learning.residual_data import ResidualData
 
 
@@ -62,10 +68,11 @@ class Rest:
     rests: Array  # recorded, (N, n)
     lengths: tuple[int, ...]  # numbers of steps of the executions
     limit: float
+    geometry: StateGeometry = PLAIN
 
     def features(self, x: Array, u: Array, before: Array) -> Array:
         """Return features ``(..., F)`` of states, inputs and the inputs before."""
-        whole = np.concatenate([x, u, u - before], axis=-1)
+        whole = np.concatenate([self.geometry.features(x), u, u - before], axis=-1)
         bounded = np.clip(np.nan_to_num((whole - self.shift) / self.scale), -self.limit, self.limit)
         return np.concatenate([np.ones((*x.shape[:-1], 1)), bounded], axis=-1)
 
@@ -77,17 +84,18 @@ def rest_of(
     steps = [with_memory(model, trajectory) for trajectory in executed]
     before = np.concatenate([np.concatenate([each.u[:1], each.u[:-1]]) for each in steps])
     source = np.repeat(np.arange(len(steps)), [len(each) for each in steps])
+    geometry = geometry_of(model)
     with np.errstate(all="ignore"):
-        errors = np.concatenate([each.x_next - predicted_steps(model, each) for each in steps])
+        errors = np.concatenate([geometry.difference(each.x_next, predicted_steps(model, each)) for each in steps])
     x, u = (np.concatenate([getattr(each, name) for each in steps]) for name in ("x", "u"))
     if not (finite := np.isfinite(errors).all(axis=1)).any():
         return None
     errors[~finite] = 0.0
-    whole = np.concatenate([x, u, u - before], axis=1)
+    whole = np.concatenate([geometry.features(x), u, u - before], axis=1)
     shift, scale = whole.mean(axis=0), whole.std(axis=0) + 1e-6 * np.abs(whole).max(axis=0) + 1e-9
     count = whole.shape[1] + 1
     empty = np.zeros((count, errors.shape[1]))
-    rest = Rest(shift, scale, empty, np.eye(count), np.zeros(errors.shape[1]), errors, (), settings.limit)
+    rest = Rest(shift, scale, empty, np.eye(count), np.zeros(errors.shape[1]), errors, (), settings.limit, geometry)
     F = rest.features(x, u, before)
     penalty = settings.ridge * np.eye(count)
     penalty[0, 0] = 1e-3
@@ -154,10 +162,11 @@ class ParametricDraws(DrawsWithoutNoise):
         before = np.where(step > 0, before, inputs)
         following, of_model = advanced(self._drawn, each, inputs, of_model)
         if self.weights.any():
-            following = following + self.rest.features(each, inputs, before) @ self.weights
+            missed = self.rest.features(each, inputs, before) @ self.weights
+            following = self.rest.geometry.add(following, missed)
         if self.rows.shape[1]:
             at = self.rows[np.arange(len(self)), int(step[0, 0, 0]) % self.rows.shape[1]]
-            following = following + self.rest.rests[at][:, None]
+            following = self.rest.geometry.add(following, self.rest.rests[at][:, None])
         memory = np.concatenate([step + 1, inputs, of_model], axis=-1).reshape(memory.shape)
         return np.asarray(following).reshape(x.shape), memory
 
@@ -174,6 +183,12 @@ class ParametricPosterior(ShortRepr):
 
     has_pivots: ClassVar[bool] = False
     noise: ClassVar[float] = 0.0  # rests are a part of draws
+
+    @property
+    def effects(self) -> Found:
+        """The effects of inputs beside the parameters."""
+        model = self.parameters.model
+        return model.effects if isinstance(model, UncertainEffects) else ()
 
     def functions_for(self, draws: int) -> int:
         """Return how many times the usual number of draws gives at least so many."""
@@ -285,19 +300,27 @@ class ParametricDynamics(LearnedDynamics):
 def learned_parameters(
     model: UncertainModel,
     executed: Sequence[Trajectory],
-    recorded: tuple[Transitions, Rows],
+    loops: Trajectory,
     seed: tuple[int, ...],
+    candidates: Found = (),
+    known: Found | None = None,
     settings: ParametricSettings = ParametricSettings(),
 ) -> ParametricPosterior | None:
-    """Return the posterior of a model's uncertain parameters and of what they leave; None if nothing is usable."""
+    """Return the posterior of a model's uncertain parameters and of what they leave; None if nothing is usable.
+
+    Effects of inputs are looked for among candidates, or are the ``known`` ones; ``loops`` are closed loops on M.
+    """
     rng = np.random.default_rng(seed)
     with single_threaded(), np.errstate(all="ignore"):
         segments = Segments.of(model, executed, rng, settings.parameters)
         if segments is None:
             return None
-        parameters = parameter_posterior(model, segments, rng, settings.parameters)
-        fitted = _Single(model.drawn(parameters.mean[None]))
-        rest, plain = rest_of(fitted, executed, settings), agreeing_posterior(fitted, *recorded, seed)
+        mode = ParameterMode.of(model, segments, settings.parameters)
+        parameters = most_probable_effects(mode, candidates, known).posterior(rng)
+        fitted = _Single(parameters.model.drawn(parameters.mean[None]))
+        recorded = recorded_transitions(fitted, None, executed, loops)
+        plain = None if recorded is None else agreeing_posterior(fitted, *recorded, seed)
+        rest = rest_of(fitted, executed, settings)
     if rest is None or plain is None:
         return None
     horizon = max(trajectory.horizon for trajectory in executed)
@@ -308,14 +331,19 @@ def learned_parameters(
 class _Single:
     """One draw as a model of its own."""
 
-    drawn: Model
+    model: Model
 
     def step(self, x: Array, u: Array) -> Array:
-        return np.asarray(np.asarray(self.drawn.step(x[None], u[None]))[0])
+        return np.asarray(self.model.step(_one(x), _one(u))).reshape(x.shape)
 
     def start(self, x: Array) -> Array:
-        return np.asarray(memory_in(self.drawn, x[None])[0])
+        return memory_in(self.model, _one(x)).reshape(*x.shape[:-1], -1)
 
     def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
-        following, memory = advanced(self.drawn, x[None], u[None], memory[None])
-        return np.asarray(following)[0], memory[0]
+        following, after = advanced(self.model, _one(x), _one(u), _one(memory))
+        return np.asarray(following).reshape(x.shape), after.reshape(memory.shape)
+
+
+def _one(part: Array) -> Array:
+    """Return states, inputs or memories ``(..., k)`` as those of one draw ``(1, q, k)``."""
+    return part.reshape(1, -1, part.shape[-1]) if part.size else np.empty((1, math.prod(part.shape[:-1]), 0))

@@ -15,6 +15,7 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.progress import advance
 from ctxval._util.representation import ShortRepr
+from ctxval.core.model import run_of
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -63,7 +64,8 @@ def _replayed(study: DynamicsStudy, model: DynamicsDraws | None, point: Array) -
         return nothing
     try:
         nominal = validation.closed_loop(controller, task)
-        predicted = rollout(model, controller, task)
+        step = study.planner.with_effects(run_of(model, task.initial_state))
+        predicted = rollout(step, controller, task)
         distance = float(validation.distance_between(nominal, predicted, task))
     except Exception:  # the same
         return nothing

@@ -13,6 +13,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.model import Model, predicted_steps
+from ctxval.core.state_geometry import PLAIN, StateGeometry, geometry_of
 from ctxval.core.trajectory import Transitions
 from ctxval.learning.dry_friction import DryFriction
 from ctxval.learning.hyperparameters import FAMILIES, ResidualKernel, climbed, learning_rows
@@ -60,10 +61,11 @@ class ResidualData:
     recorded: Array
     executed: Mask
     executions: Transitions  # those of executions, also of joints that friction holds
+    geometry: StateGeometry = PLAIN  # of the states of M
 
     def standardised(self, x: Array, u: Array) -> Array:
-        """Return standardised pairs ``(..., n + m)`` of states and the first m inputs, which act."""
-        return standardised_pairs(x, u[..., : self.inputs], self.shift, self.scale)
+        """Return standardised pairs ``(..., n + m)`` of states and acting inputs."""
+        return standardised_pairs(self.geometry.features(x), u, self.shift, self.scale)
 
 
 def residual_data(
@@ -73,15 +75,16 @@ def residual_data(
 
     With ``unlearned``, no state counts as one with a residual that is not negligible.
     """
-    recorded, moving = np.concatenate([transitions.x, transitions.u], axis=1), np.ones(len(transitions), dtype=np.bool_)
-    every = transitions
+    geometry = geometry_of(model)
+    recorded = np.concatenate([geometry.features(transitions.x), transitions.u], axis=1)
+    every, moving = transitions, np.ones(len(transitions), dtype=np.bool_)
     if isinstance(model, DryFriction):
         transitions, moving = model.acting(transitions)
         model = model.model
     with np.errstate(all="ignore"):
-        residuals = transitions.x_next - predicted_steps(model, transitions)
-        steps = transitions.x_next - transitions.x
-    pairs = np.concatenate([transitions.x, transitions.u], axis=1)
+        residuals = geometry.difference(transitions.x_next, predicted_steps(model, transitions))
+        steps = geometry.difference(transitions.x_next, transitions.x)
+    pairs = np.concatenate([geometry.features(transitions.x), transitions.u], axis=1)
     # Larger numbers have diverged, and their squares would not be finite.
     usable = (np.abs(np.concatenate([pairs, residuals, steps], axis=1)) < 1e100).all(axis=1)
     teach = usable & moving
@@ -111,13 +114,14 @@ def residual_data(
         recorded=(recorded[usable] - shift) / scale,
         executed=sources[usable] >= 0,
         executions=every[np.flatnonzero(usable & (sources >= 0))],
+        geometry=geometry,
     )
 
 
 def smoother_than(data: ResidualData, count: int) -> tuple[Model, ResidualData] | None:
     """Return a linear model and its residuals if these are far more probable than M's, by ``count`` transitions."""
     # With at least 10 transitions for each coefficient, the fit itself explains little.
-    if len(data.pairs) < 10 * (data.pairs.shape[1] + 1):
+    if len(data.pairs) < 10 * (data.pairs.shape[1] + 1) or data.geometry.quaternions:  # no linear model turns
         return None
     known = data.transitions
     predicted = known.x_next - data.outputs * data.units

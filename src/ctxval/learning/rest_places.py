@@ -218,7 +218,7 @@ def predicted_departures(
     rate, found = int(friction.rates[joint]), list[tuple[Array, Array, Rows]]()
     slow = friction.still[joint] / friction.settings.held
     for plan, each in zip(planned, loops, strict=True):
-        x, u = each.states[0], each.inputs[0, ..., : posterior.data.inputs]
+        x, u = each.states[0], each.inputs[0]
         before, after = x[:, :-1, rate], x[:, 1:, rate]
         may = (np.abs(before) <= slow) & (np.abs(after) > np.abs(before)) & (np.abs(after) > SETTINGS.moves_off * slow)
         may |= before * after < 0

@@ -73,8 +73,8 @@ class RunStatistics:
         learned = self.learned if learned is None else learned
         study, floors = learned.study, self.floors**2
         if point is None:
-            inputs = trajectory.inputs if study.actuator is None else study.actuator.acting(trajectory.inputs)
-            record = Record(trajectory.states, inputs, trajectory.states[0])
+            acting = study.extended.effects.acting(trajectory.inputs)
+            record = Record(trajectory.states, acting, trajectory.states[0])
         else:
             (record,) = study.extended.records([(point, trajectory)])
         with single_threaded(), np.errstate(all="ignore"):

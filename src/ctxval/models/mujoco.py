@@ -13,6 +13,7 @@ from ctxval._util.mjcf import Simulator, compile_mjcf, is_mjcf_text, quiet
 from ctxval._util.refusals import require_extra
 from ctxval._util.registry import part
 from ctxval.core.model import paired
+from ctxval.core.state_geometry import StateGeometry
 from ctxval.core.trajectory import Transitions
 from ctxval.core.uncertain import UncertainParameter
 from ctxval.errors import InputError
@@ -87,6 +88,12 @@ class MuJoCo:
     def compiled(self) -> Any:
         """The compiled ``mujoco.MjModel``, which must not be changed: :meth:`changed` changes a copy."""
         return self._simulator.model
+
+    @property
+    def geometry(self) -> StateGeometry:
+        """The quaternions of free and of ball joints in the state."""
+        places = zip(self.compiled.jnt_qposadr.tolist(), self.compiled.jnt_type.tolist(), strict=True)
+        return StateGeometry(tuple(at + 3 * (kind == 0) for at, kind in places if kind <= 1))
 
     def changed(self, change: Callable[[Any], None] | None = None, *, forces: Array | None = None) -> MuJoCo:
         """Return the model after a function has changed its compiled ``mujoco.MjModel``.

@@ -16,6 +16,7 @@ class DeadZone(OfInput):
     """An input has no effect near 0. Size: the magnitude below which it has none, and which is lost above."""
 
     name: ClassVar[str] = "dead zone"
+    kinked: ClassVar[bool] = True
     words: ClassVar[str] = "{name} has a dead zone of {size:.3g} {unit}"
 
     def acts(self, u: Array, before: Array) -> Array:

@@ -33,6 +33,7 @@ class Effect(ShortRepr):
 
     sizes: tuple[Size, ...]
     name: ClassVar[str]  #: what it is in two or three words
+    kinked: ClassVar[bool] = False  #: whether what acts is no smooth function of what is commanded
 
     @classmethod
     def candidates(cls, observed: Observed) -> Iterable[EffectCandidate]:

@@ -20,6 +20,7 @@ from ctxval.errors import InputError
 from ctxval.learning.draws import Draws
 from ctxval.learning.effects.effect import Effect, beside
 from ctxval.learning.effects.flow import Flow, Linearisation
+from ctxval.learning.effects.inputs import InputEffects
 from ctxval.models import MuJoCo
 
 
@@ -81,16 +82,14 @@ class ModelWithEffects(ShortRepr):
         return [effect for effect in self.effects if type(effect).allowed is not Effect.allowed]
 
     @functools.cached_property
-    def _of_inputs(self) -> list[Effect]:
+    def of_inputs(self) -> InputEffects:
+        """The effects of inputs."""
         acting = [effect for effect in self.effects if type(effect).act is not Effect.act]
-        return sorted(acting, key=lambda effect: effect.in_parts)
-
-    def _remembered(self, inputs: int) -> int:
-        return sum(effect.remembered(inputs) for effect in self.effects)
+        return InputEffects(tuple(sorted(acting, key=lambda effect: effect.in_parts)))
 
     def start(self, x: Array) -> Array:
         """Return the memory ``(..., k)`` of closed loops that start in recorded states ``(..., n)``."""
-        if self._remembered(1) and not self.inputs:
+        if self.of_inputs.remembered(1) and not self.inputs:
             raise InputError(
                 "a model whose effects remember inputs needs their number: ModelWithEffects(..., inputs=m)."
             )
@@ -101,7 +100,7 @@ class ModelWithEffects(ShortRepr):
             of_model = np.stack([memory_in(each.mechanics, few) for each, few in zip(self._one_by_one, x, strict=True)])
         else:
             of_model = memory_in(self.mechanics, x)
-        return np.concatenate([np.zeros((*x.shape[:-1], self._remembered(inputs))), of_model], axis=-1)
+        return np.concatenate([np.zeros((*x.shape[:-1], self.of_inputs.remembered(inputs))), of_model], axis=-1)
 
     def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
         """Return the next recorded states ``(..., n)`` and the new memory, with all effects."""
@@ -109,8 +108,8 @@ class ModelWithEffects(ShortRepr):
         return self.recorded(following), memory
 
     def _advanced(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
-        k = self._remembered(u.shape[-1])
-        acting, kept = self.act(u, memory[..., :k])
+        k = self.of_inputs.remembered(u.shape[-1])
+        acting, kept = self.of_inputs.act(u, memory[..., :k])
         following, of_model = self._following(x, acting, memory[..., k:])
         return following, np.concatenate([kept, of_model], axis=-1)
 
@@ -119,23 +118,13 @@ class ModelWithEffects(ShortRepr):
         if x.ndim != u.ndim:
             x, u = map(np.array, paired(x, u))
         nothing = np.empty((*x.shape[:-1], 0))
-        for effect in self._of_inputs:
+        for effect in self.of_inputs.effects:
             u = u if effect.remembers else effect.act(u, nothing)[0]
         return self.recorded(self._following(self.true(x), u, nothing)[0])
 
-    def act(self, u: Array, memory: Array) -> tuple[Array, Array]:
-        """Return the inputs that act ``(..., m)``, see :meth:`Effect.act`, and what effects remember ``(..., k)``."""
-        first, kept, inputs = 0, [memory[..., :0]], u.shape[-1]
-        for effect in self._of_inputs:
-            last = first + effect.remembered(inputs)
-            u, after = effect.act(u, memory[..., first:last])
-            kept.append(after)
-            first = last
-        return u, np.concatenate(kept, axis=-1)
-
     def acting(self, inputs: Array) -> Array:
-        """Return the inputs that act in each step, for commanded ones ``(..., H, m)``; see :meth:`Effect.act`."""
-        return functools.reduce(lambda inputs, effect: effect.acting(inputs), self._of_inputs, inputs)
+        """Return the inputs that act in each step; see :meth:`InputEffects.acting`."""
+        return self.of_inputs.acting(inputs)
 
     def _following(self, x: Array, acting: Array, memory: Array) -> tuple[Array, Array]:
         """Return the next states for the inputs that act, and the memory of M; without it, M begins anew."""

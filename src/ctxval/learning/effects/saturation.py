@@ -17,6 +17,7 @@ class Saturation(OfInput):
     """An input is limited. Size: the limit of its magnitude."""
 
     name: ClassVar[str] = "saturation"
+    kinked: ClassVar[bool] = True
     words: ClassVar[str] = "{name} saturates at {size:.3g} {unit}"
 
     @classmethod

@@ -1,0 +1,58 @@
+"""A model with uncertain parameters whose inputs have effects of uncertain sizes, such as a delay."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+from ctxval._util.arrays import Array
+from ctxval._util.representation import ShortRepr
+from ctxval.core.model import Model
+from ctxval.core.uncertain import UncertainModel, UncertainParameter
+from ctxval.learning.effects.effect import EffectCandidate
+from ctxval.learning.effects.model import ModelWithEffects
+
+
+@dataclass(frozen=True, eq=False)
+class UncertainEffects(ShortRepr):
+    """A model with uncertain parameters and effects of its m inputs; their sizes are further parameters.
+
+    The prior of a size is normal around that of the effect, with a deviation of five of its scales.
+    """
+
+    given: UncertainModel
+    effects: tuple[EffectCandidate, ...]
+    inputs: int
+
+    @functools.cached_property
+    def uncertain(self) -> tuple[UncertainParameter, ...]:
+        """The parameters of the model, and the sizes of the effects."""
+        sizes = [
+            UncertainParameter(parameter.name, float(size), 5 * parameter.scale, relative=False, low=parameter.low)
+            for each in self.effects
+            for parameter, size in zip(each.parameters, each.effect.sizes, strict=True)
+        ]
+        return *self.given.uncertain, *sizes
+
+    def drawn(self, z: Array) -> Model:
+        """Return S models with standardised parameters ``(S, K)``; see :class:`UncertainModel`."""
+        of_model = len(self.given.uncertain)
+        sizes = iter(each.at(z[:, k, None]) for k, each in enumerate(self.uncertain) if k >= of_model)
+        effects = tuple(each.effect.with_sizes([next(sizes) for _ in each.parameters]) for each in self.effects)
+        return ModelWithEffects(self.given.drawn(z[:, :of_model]), effects, self.inputs)
+
+    @functools.cached_property
+    def _usual(self) -> ModelWithEffects:
+        return ModelWithEffects(self.given, tuple(each.effect for each in self.effects), self.inputs)
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next states with the usual sizes; effects that remember are left out."""
+        return self._usual.step(x, u)
+
+    def start(self, x: Array) -> Array:
+        """Return the memory ``(..., k)`` of closed loops that start in states ``(..., n)``."""
+        return self._usual.start(x)
+
+    def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
+        """Return the next states and the new memory, as :class:`ctxval.core.model.ModelWithMemory`."""
+        return self._usual.advance(x, u, memory)

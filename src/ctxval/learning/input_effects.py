@@ -1,0 +1,229 @@
+"""Effects of inputs that no smooth residual has, found in executions: delay, lag, backlash, dead zone and others.
+
+With them, what S does in a step is no smooth function of the state and the command. It is one of the state and the
+input that acts, which follows from the recorded commands. Of all effects of the dictionary, those are found with which
+the residual of M is most probably such a function: a greedy search by the evidence of the Gaussian process of the
+residual, with steps back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from ctxval._util.arrays import Array, Mask, Rows
+from ctxval.core.model import Model
+from ctxval.learning.effects.dictionary import kinds
+from ctxval.learning.effects.effect import EffectCandidate, Observed, OfInput
+from ctxval.learning.effects.inputs import InputEffects
+from ctxval.learning.effects.plant import Plant
+from ctxval.learning.effects.transport import Delay, Late
+from ctxval.learning.histories import History, Record, Structure
+from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior, Mode, learning_rows, log_posterior
+from ctxval.learning.residual_data import floors
+from ctxval.models.increments import standard_deviations
+
+
+@dataclass(frozen=True)
+class InputEffectSettings:
+    """How clearly effects of inputs must explain the residual, and how many are tried."""
+
+    better: float = 0.3  # by which each effect must raise the log evidence per recorded value
+    close: float = 0.1  # by which it may lower it before its sizes are refined
+    most: int = 2  # effects
+    smooth: float = 20.0  # length-scale of inputs in their deviations, with which kinks are looked for first
+    learned_from: int = 150  # transitions
+    climbed: int = 4  # candidates whose hyperparameters are searched for
+    evaluations: int = 80  # of the residual while sizes are refined, twice
+    estimated: int = 30  # the same if states have to be estimated each time
+
+
+Found = tuple[EffectCandidate, ...]
+RecordsOf = Callable[[InputEffects], Sequence[Record]]
+"""Returns executions with the inputs that act, and with states that are estimated with these if they must be."""
+
+
+def input_candidates(
+    model: Model, dt: float, inputs: Sequence[tuple[str, str]], commands: Array, seconds: float, *, together: bool
+) -> Found:
+    """Return the effects that inputs may have and no smooth residual has, for commands ``(N, m)`` and their names.
+
+    Only those of all inputs ``together`` are returned if each costs too much.
+    """
+    plant = Plant(model, dt, [], list(inputs), (), (), np.empty(0), np.maximum(np.abs(commands).max(axis=0), 1e-9))
+    observed = Observed(plant, np.empty((0, 0)), commands, np.empty(0), seconds, estimated=False)
+    of_inputs = [kind for kind in kinds() if issubclass(kind, Late if together else (Late, OfInput))]
+    every = [each for kind in of_inputs for each in kind.candidates(observed)]
+    return tuple(each for each in every if (each.effect.remembers or each.effect.kinked) and not each.effect.in_parts)
+
+
+def found_effects(
+    model: Model,
+    records_of: RecordsOf,
+    candidates: Found,
+    before: Found = (),
+    *,
+    estimated: bool = False,
+    settings: InputEffectSettings = InputEffectSettings(),
+) -> Found:
+    """Return the effects of inputs with which the residual of M is most probably a function; none if they do not help.
+
+    Each raises the log evidence per recorded value, with the hyperparameters at their mode, clearly. Those that were
+    found ``before``, in fewer executions, are the first guess. A LinAlgError is raised if states cannot be estimated.
+    """
+    evaluations = settings.estimated if estimated else settings.evaluations
+    search = _Search.of(model, records_of, candidates, evaluations, settings)
+    if search is None:
+        return ()
+    best: Found = ()
+    needed, mode = search.settings.better * search.values, search.mode(())
+    if before:
+        refined, of_refined = search.refined(before)
+        if of_refined.height > mode.height + needed:
+            best, mode = refined, of_refined
+    while len(best) < settings.most:
+        longer = search.longer(best, mode, needed)
+        if longer is None:
+            break
+        best, mode = longer
+        for each in best if len(best) > 1 else ():  # one may explain alone what two explain in part
+            shorter, of_shorter = search.refined(tuple(other for other in best if other is not each))
+            if of_shorter.height > mode.height - needed:
+                best, mode = shorter, of_shorter
+                break
+    return best
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The evidence of effects of inputs."""
+
+    records_of: RecordsOf
+    history: History
+    candidates: Found
+    rows: Rows  # of the transitions that hyperparameters are learned from
+    live: Mask  # which states have a residual that is no rounding
+    sizes: Array  # of the residuals if commands act at once, (n,)
+    inputs: int
+    evaluations: int
+    settings: InputEffectSettings
+
+    @classmethod
+    def of(
+        cls, model: Model, records_of: RecordsOf, candidates: Found, evaluations: int, settings: InputEffectSettings
+    ) -> _Search | None:
+        """Return the search; None if M misses nothing."""
+        records = records_of(InputEffects())
+        history = History(model, Structure(0), np.eye(records[0].states.shape[1]))
+        Z, E, _ = history.along(records)
+        steps = np.concatenate([np.diff(each.states, axis=0) for each in records])
+        sizes, inputs = np.sqrt((E**2).mean(axis=0)), records[0].inputs.shape[-1]
+        live = sizes > floors(np.concatenate([each.states[1:] for each in records]), steps)
+        if not live.any():
+            return None
+        rows = learning_rows(_standardised(Z), inputs, settings.learned_from)
+        return cls(records_of, history, candidates, rows, live, sizes, inputs, evaluations, settings)
+
+    @property
+    def values(self) -> int:
+        """The number of recorded values that are explained."""
+        return len(self.rows) * int(self.live.sum())
+
+    def data(self, effects: Found) -> tuple[Array, Array]:
+        """Return states and acting inputs ``(N, n + m)``, and residuals over their sizes if commands act at once."""
+        Z, E, _ = self.history.along(self.records_of(InputEffects(tuple(each.effect for each in effects))))
+        return Z[self.rows], E[self.rows][:, self.live] / self.sizes[self.live]
+
+    def mode(self, effects: Found) -> Mode:
+        """Return the most probable hyperparameters with effects."""
+        Z, E = self.data(effects)
+        return HyperparameterPosterior.given(_standardised(Z), E, self.inputs, FAMILIES[:1]).highest
+
+    def longer(self, effects: Found, mode: Mode, needed: float) -> tuple[Found, Mode] | None:
+        """Return effects with the one more that explains most, and their mode; None if it explains too little."""
+        kinds_of = {each.effect.kind for each in effects}
+        tried = [
+            self._ordered((*effects, _sized(each, start)))
+            for each in self.candidates
+            if each.effect.kind not in kinds_of
+            for start in _starts(each)
+        ]
+        if len(tried) > self.settings.climbed:  # those that explain most with the hyperparameters that are known
+            of_tried = [self.data(each) for each in tried]
+            heights = [log_posterior(mode.kernel, mode.place, _standardised(Z), E)[0] for Z, E in of_tried]
+            tried = [tried[k] for k in sorted(range(len(tried)), key=lambda k: -heights[k])]
+        climbed = [(self.mode(each), each) for each in tried[: self.settings.climbed]]
+        if not climbed:
+            return None
+        highest, best = max(climbed, key=lambda pair: pair[0].height)
+        if highest.height < mode.height - self.settings.close * self.values:
+            return None
+        best, highest = self.refined(best, highest)
+        return (best, highest) if highest.height > mode.height + needed else None
+
+    def _ordered(self, effects: Found) -> Found:
+        """Return effects in the order of the dictionary, in which they act."""
+        kinds_of = [each.effect.kind for each in self.candidates]
+        return tuple(sorted(effects, key=lambda each: kinds_of.index(each.effect.kind)))
+
+    def refined(self, effects: Found, mode: Mode | None = None) -> tuple[Found, Mode]:
+        """Return effects with their most likely sizes, and their mode."""
+        mode = self.mode(effects) if mode is None else mode
+        if any(each.effect.kinked for each in effects):  # a residual that is rough in inputs imitates kinks elsewhere
+            smooth = mode.place.copy()
+            inputs = slice(len(smooth) - 3 - self.inputs, len(smooth) - 3)
+            smooth[inputs] = np.maximum(smooth[inputs], np.log(self.settings.smooth))
+            other = self._most_likely(effects, mode, smooth)
+            of_other = self.mode(other)
+            if of_other.height > mode.height:
+                effects, mode = other, of_other
+        for _ in range(2):  # the noise that wrong sizes seem to add is less the second time
+            effects = self._most_likely(effects, mode, mode.place)
+            mode = self.mode(effects)
+        return effects, mode
+
+    def _most_likely(self, effects: Found, mode: Mode, place: Array) -> Found:
+        Z, _ = self.data(effects)
+        shift, scale = Z.mean(axis=0), standard_deviations(Z)
+        parameters = [parameter for each in effects for parameter in each.parameters]
+        low, high, steps = (np.array([getattr(p, name) for p in parameters]) for name in ("low", "high", "scale"))
+
+        def unlikely(values: Array) -> float:
+            Z, E = self.data(_all_sized(effects, np.clip(values[:-1], low, high)))
+            return -log_posterior(mode.kernel, np.append(place[:-1], values[-1]), (Z - shift) / scale, E)[0]
+
+        # The noise changes with the sizes: what wrong sizes leave is no smooth function.
+        at = np.array([*(size for each in effects for size in each.effect.sizes), place[-1]])
+        moves = np.append(np.where(at[:-1] + steps <= high, steps, -steps), -2.0)
+        simplex = at + np.concatenate([np.zeros((1, len(at))), np.diag(moves)])
+        options = {"initial_simplex": simplex, "maxfev": self.evaluations, "xatol": 1e-5, "fatol": 1e-3}
+        best = scipy.optimize.minimize(unlikely, at, method="Nelder-Mead", options=options).x
+        best[:-1] = np.clip(best[:-1], low, high)
+        # Delays of whole steps are preferred as by the Bayesian information criterion.
+        are_delays = [*(isinstance(each.effect, Delay) for each in effects for _ in each.parameters), False]
+        whole = np.where(are_delays, np.round(best), best)
+        near = [(best, 0.5 * np.log(len(self.rows)) * sum(are_delays)), (whole, 0.0)]
+        return _all_sized(effects, min(near, key=lambda pair: unlikely(pair[0]) + pair[1])[0][:-1])
+
+
+def _standardised(Z: Array) -> Array:
+    return np.asarray((Z - Z.mean(axis=0)) / standard_deviations(Z))
+
+
+def _starts(candidate: EffectCandidate) -> list[tuple[float, ...]]:
+    """Return first guesses of sizes; without any but 0, a few steps of a fit to both sides."""
+    if any(any(start) for start in candidate.starts):
+        return list(candidate.starts)
+    return [tuple(sign * 4 * parameter.scale for parameter in candidate.parameters) for sign in (-1, 1)]
+
+
+def _sized(candidate: EffectCandidate, sizes: Sequence[float]) -> EffectCandidate:
+    return replace(candidate, effect=candidate.effect.with_sizes(sizes))
+
+
+def _all_sized(effects: Found, sizes: Array) -> Found:
+    left = iter(sizes.tolist())
+    return tuple(_sized(each, [next(left) for _ in each.parameters]) for each in effects)

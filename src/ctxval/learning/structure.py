@@ -1,0 +1,241 @@
+"""The structure of the dynamics beside a smooth residual: which parts explain what M misses.
+
+A part is a set of effects of inputs, dry friction, the data that M was made from (which may belong to another system),
+or a task parameter that changes the dynamics. One greedy search adds parts by one criterion: the errors of the next
+states of each execution when it is predicted from the others. A structure is the :class:`DynamicsStudy` that learns
+with its parts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ctxval._util.arrays import single_threaded
+from ctxval.errors import InputError
+from ctxval.learning.dry_friction import FrictionSettings, found_friction
+from ctxval.learning.effects.inputs import InputEffects
+from ctxval.learning.extended import ExtendedValidation
+from ctxval.learning.histories import Record
+from ctxval.learning.input_effects import Found, InputEffectSettings, found_effects
+from ctxval.learning.learned_dynamics import LearnedDynamics
+from ctxval.learning.prediction import Executed
+from ctxval.learning.recorded import digest, schedule
+from ctxval.learning.stage_costs import Costs, Ledger
+from ctxval.models.corrected import before_refinement
+
+if TYPE_CHECKING:
+    from ctxval.learning.dynamics_study import DynamicsStudy
+
+
+@dataclass(frozen=True)
+class StructureSettings:
+    """When parts are looked for, and how much of the left-out errors each must explain.
+
+    Errors are shares of those of M.
+    """
+
+    #: of each part: executions from which on it is looked for, the left-out error above which it is, and the share of
+    #: this error that it must leave at most
+    inputs: tuple[int, float, float] = (3, 0.02, 0.5)
+    friction: tuple[int, float, float] = (4, 0.1, 0.5)
+    data: tuple[int, float, float] = (3, 0.1, 1 / 3)
+    parameter: tuple[int, float, float] = (6, 0.1, 1 / 3)
+    small: float = 0.1  # left-out error that data of M and a task parameter must leave at most
+    enough: float = 0.02  # left-out error below which no further part is compared
+    kept: float = 2.0  # share of parts found before: single steps tell less of dry friction than loops do
+    noise: float = 0.75  # largest share of the squares of errors that counts as noise
+    estimated_from: int = 5  # latest executions, if states are estimated: it costs as much as hundreds of steps
+    dry_friction: FrictionSettings = field(default_factory=FrictionSettings)
+    input_effects: InputEffectSettings = field(default_factory=InputEffectSettings)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part that dynamics may have."""
+
+    name: str  # as the budget of thinking names it
+    limits: tuple[int, float, float]  # see :class:`StructureSettings`
+    seconds: Callable[[Costs], float]
+    add: Callable[[DynamicsStudy, Executed], DynamicsStudy | None]  # a study with it; None if it explains nothing
+    has: Callable[[DynamicsStudy], bool]
+    most: float = np.inf  # left-out error that it must leave at most
+
+
+class StructureSearch:
+    """Finds the structures of growing sets of executions; each is a function of these."""
+
+    def __init__(self, plain: DynamicsStudy, settings: StructureSettings) -> None:
+        self.plain, self.settings = plain, settings
+        self._known: dict[bytes, DynamicsStudy] = {}
+        names = len(plain.given.space.units) + 1
+        estimated, small = plain.given.outputs is not None, settings.small
+        parts = [
+            Part(
+                "inputs that act late", settings.inputs, Costs.input_effects,
+                self.with_inputs, lambda study: bool(study.effects),
+            ),
+            Part(
+                "dry friction", settings.friction, Costs.friction,
+                self.with_friction, lambda study: study.friction is not None,
+            ),
+            Part(
+                "the data of M", settings.data, Costs.learning, _without_data, lambda study: not study.with_data, small
+            ),
+            Part(
+                "parameters that change the dynamics", settings.parameter, lambda costs: names * costs.learning(),
+                lambda study, executed: most_telling(study, executed)[0],
+                lambda study: len(study.given.physical) > len(plain.given.physical), small,
+            ),
+        ]  # fmt: skip
+        self.parts = [part for part in parts if not (estimated and part.name == "dry friction")]
+
+    def best(self, executed: Executed, learned: LearnedDynamics, ledger: Ledger) -> LearnedDynamics:
+        """Return what executions teach with the structure that they show, for what they teach without."""
+        settings, count = self.settings, len(executed)
+        asked = [
+            part
+            for part in self.parts
+            if count < part.limits[0]
+            or not learned.left_out_error > part.limits[1]
+            or ledger.learns("learning", part.name, part.seconds)
+        ]
+        study, key_of_parts = self.plain, bytes(part in asked for part in self.parts)
+        for some in (executed[:number] for number in schedule(min(part.limits[0] for part in self.parts), count)):
+            key = digest(trajectory for _, trajectory in some) + key_of_parts
+            if key not in self._known:
+                self._known[key] = study  # also if the search fails
+                with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
+                    is_all = study is self.plain and len(some) == count
+                    self._known[key] = self._searched(some, study, asked, learned if is_all else None)
+            study = self._known[key]
+        found = None if study is self.plain else study.learned_alone(executed, ledger)
+        return learned if found is None or not share_left(found, learned, settings) < settings.kept else found
+
+    def _searched(
+        self, executed: Executed, before: DynamicsStudy, asked: list[Part], known: LearnedDynamics | None
+    ) -> DynamicsStudy:
+        """Return the structure of executions, for that of fewer ones before; what it teaches may be known."""
+        study = self._fitted_again(executed, before)
+        learned = study.learned_alone(executed) if known is None and asked else known
+        for _ in asked:
+            best: tuple[float, LearnedDynamics] | None = None
+            if learned is None:
+                break
+            for part in asked:
+                first, error, share = part.limits
+                if part.has(study) or len(executed) < first or not learned.left_out_error > error:
+                    continue
+                tried = part.add(study, executed)
+                found = None if tried is None else tried.learned_alone(executed)
+                if found is None:
+                    continue
+                left = share_left(found, learned, self.settings)
+                if left < share and found.left_out_error < part.most and (best is None or left < best[0]):
+                    best = left, found
+                    if found.left_out_error < self.settings.enough:
+                        break
+            if best is None:
+                break
+            learned = best[1]
+            study = learned.study
+        return study
+
+    def _fitted_again(self, executed: Executed, before: DynamicsStudy) -> DynamicsStudy:
+        """Return a study with the parts of one before, with sizes for these executions."""
+        if before is self.plain:
+            return before
+        study = self.plain.made(given=before.given, with_data=before.with_data)
+        if before.effects:
+            study = self.with_inputs(study, executed, before.effects) or study
+        if before.friction is not None:
+            study = self.with_friction(study, executed) or study.made(friction=before.friction)
+        return study
+
+    # Parts
+
+    def with_inputs(self, study: DynamicsStudy, executed: Executed, before: Found = ()) -> DynamicsStudy | None:
+        """Return a study with the effects of inputs that executions show; those found before are the first guess."""
+        given, estimated = study.given, study.given.outputs is not None
+        if study.friction is not None:
+            return None  # its steps at rest teach nothing of inputs that act late
+        among = executed[-self.settings.estimated_from :] if estimated else executed
+        commanded = [trajectory.inputs for _, trajectory in among]
+        alike = len({u.shape for u in commanded}) == 1
+
+        def with_inputs(effects: InputEffects) -> list[Record]:
+            acting = effects.acting(np.stack(commanded)) if alike else map(effects.acting, commanded)
+            return [Record(record.states, u, record.start) for record, u in zip(plain, acting, strict=True)]
+
+        def estimated_with(effects: InputEffects) -> list[Record]:
+            extended = ExtendedValidation(given, effects)
+            known = extended.executions(among, len(among))
+            if known is None:
+                raise np.linalg.LinAlgError
+            return extended.records(known)
+
+        # If states are recorded, they are the same with all effects.
+        plain = [] if estimated else estimated_with(InputEffects())
+        model = before_refinement(study.validation.model)
+        # If states have to be estimated each time, single inputs cost too much.
+        candidates = study.input_candidates([trajectory for _, trajectory in among], together=estimated)
+        with single_threaded(), np.errstate(all="ignore"):
+            found = found_effects(
+                model, estimated_with if estimated else with_inputs, candidates, before,
+                estimated=estimated, settings=self.settings.input_effects,
+            )  # fmt: skip
+        return study.made(effects=found) if found else None
+
+    def with_friction(self, study: DynamicsStudy, executed: Executed) -> DynamicsStudy | None:
+        """Return a study with the dry friction that executions show."""
+        extended, model = study.extended.executions(executed), before_refinement(study.validation.model)
+        recorded = study.transitions_of(extended, with_data=False) if extended else None
+        friction, settings = None, self.settings.dry_friction
+        with single_threaded(), np.errstate(all="ignore"), contextlib.suppress(RuntimeError):  # of the least squares
+            friction = None if recorded is None else found_friction(model, recorded[0], settings)
+        return None if friction is None else study.made(friction=friction)
+
+
+def _without_data(study: DynamicsStudy, executed: Executed) -> DynamicsStudy | None:
+    return study.made(with_data=False) if study.has_data and not study.effects else None
+
+
+def most_telling(study: DynamicsStudy, executed: Executed) -> tuple[DynamicsStudy | None, float, float]:
+    """Return the study with the task parameter with which predictions err least, and left-out errors with and without.
+
+    The data that M was made from tell no parameters.
+    """
+    without = study.made(with_data=False)
+    best, least = None, np.inf
+    for name in study.given.space.units:
+        if name not in study.given.physical:
+            other = without.made(given=study.given.with_parts(physical=[*study.given.physical, name]))
+            learned = other.learned_alone(executed)
+            if learned is not None and learned.left_out_error < least:
+                best, least = other, learned.left_out_error
+    learned = without.learned_alone(executed)
+    return best, least, 0.0 if learned is None else learned.left_out_error
+
+
+def share_left(found: LearnedDynamics, without: LearnedDynamics, settings: StructureSettings) -> float:
+    """Return the left-out error with more parts as a share of that without; infinity if one is not known.
+
+    What the Gaussian processes take for noise is no part of them. Of dry friction, only the rates that it slows count:
+    where a joint stops within a step changes its position a little, which nothing predicts.
+    """
+    friction, n = found.study.friction, len(without.model_errors)
+    alone = friction is not None and without.study.friction is None
+    states = friction.rates if friction is not None and alone else without.posterior.data.learned
+    units = np.maximum(without.model_errors, 1e-300)
+    noise = float(((found.posterior.deviations[:n] / units)[states] ** 2).sum())
+    squares, squares_without = (
+        float(((each.left_out_errors * each.model_errors)[:n][states] ** 2 / units[states] ** 2).sum())
+        for each in (found, without)
+    )
+    noise = min(noise, settings.noise * min(squares, squares_without))
+    left = np.sqrt((squares - noise) / max(squares_without - noise, 1e-300))
+    return float(left) if np.isfinite(left) else np.inf
