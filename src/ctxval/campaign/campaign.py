@@ -196,6 +196,7 @@ class Campaign:
         confidence: float = CONFIDENCE,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
+        share: float = 1.0,
         until: Callable[[Campaign], bool] | None = None,
         again: str | None = None,
         workers: PositiveInt | None = None,
@@ -229,7 +230,7 @@ class Campaign:
                 which the distance stays below the threshold; see :meth:`envelope`.
             within: without a threshold, the share by which the bound may exceed the largest executed distance at the
                 end.
-            confidence, resolution, certificate: as in :meth:`verdict`; unless the campaign explores, the
+            confidence, resolution, certificate, share: as in :meth:`verdict`; unless the campaign explores, the
                 kind of the certificate must be ``auto``, ``dynamics``, ``posterior`` or, with an acceptable volume,
                 ``anytime``.
             until: called before each execution; the campaign stops early if it returns True.
@@ -254,7 +255,7 @@ class Campaign:
                 executions are stored, and running again continues after the trial that failed.
             CampaignError: if there are no workers any more.
         """
-        options = CertificateOptions.or_automatic(certificate, confidence, resolution)
+        options = CertificateOptions.or_automatic(certificate, confidence, resolution, share)
         if explore is None:
             explore = threshold is None and not isinstance(self.search, Auto)
         decides = None if explore else IntervalSearch(self.recorder, options, budget, threshold, within)
@@ -529,7 +530,9 @@ class Campaign:
         """
         known, judged = self.provenance, self.recorder.trials if trials is None else trials
         kind, confidence = options.kind, options.confidence
-        if threshold is not None and counterexample(judged, threshold, known.quantities, confidence, kind.quantile):
+        if threshold is not None and counterexample(
+            judged, threshold, known.quantities, confidence, kind.quantile, kind.share
+        ):
             return known
         return replaced(known, learned=self.recorder.dynamics.learned_for(judged, options))
 
@@ -551,6 +554,7 @@ class Campaign:
         *,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
+        share: float = 1.0,
         thinking: TimeLimit | None = None,
         progress: bool | None = None,
     ) -> Verdict:
@@ -565,14 +569,17 @@ class Campaign:
             confidence: the confidence level of the certificate, at least 0.5.
             resolution: the largest distance between a task and its nearest trial that a validation permits, in
                 diagonals of the task space.
-            certificate: the kind and the options of the certificate, in place of ``auto`` with the two options above.
+            certificate: the kind and the options of the certificate, in place of ``auto`` with the other options.
+            share: the share of the tasks that must stay below the threshold, from 0.5 to 1. With less than 1, the model
+                is falsified if executions at drawn tasks prove that more of them exceed it.
             thinking: as in :meth:`run`. If its evidence needs more, the verdict is undecided with the code ``no_time``.
             progress: as in :meth:`run`.
 
         Raises:
             CertificateError: if an option of the certificate is not valid.
         """
-        options, recorder = CertificateOptions.or_automatic(certificate, confidence, resolution), self.recorder
+        options = CertificateOptions.or_automatic(certificate, confidence, resolution, share)
+        recorder = self.recorder
         self.state_threshold(threshold)
         recorder.dynamics.shortage = None
         with progress_shown(progress), stage("certifying"), recorder.dynamics.thinking.limited(thinking):
@@ -590,13 +597,14 @@ class Campaign:
         *,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
+        share: float = 1.0,
         progress: bool | None = None,
     ) -> Certificate:
         """Return the bound on d*, which needs no threshold. The arguments are those of :meth:`verdict`.
 
         A CertificateError is raised if the theory of the certificate refuses the trials.
         """
-        options = CertificateOptions.or_automatic(certificate, confidence, resolution)
+        options = CertificateOptions.or_automatic(certificate, confidence, resolution, share)
         with progress_shown(progress), stage("certifying"):
             certified = assess(self.trials, options, provenance=self.provenance_for(options)).certificate
         assert certified is not None  # without a threshold, a refusal is raised

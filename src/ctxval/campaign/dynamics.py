@@ -80,10 +80,10 @@ class CampaignDynamics:
         # Predictions that no store has, by their trials: each verdict checks those of the last trials.
         self._afterwards: Latest[Any, ExecutionPrediction | None] = Latest(2 * LIMITS.predictions)
 
-    def use_quantile(self, quantile: float) -> None:
-        """State the share of the executions of a task that distances are about, if the system is noisy."""
-        if quantile != self.study.quantile:
-            self._use(self.study.fresh_copy(quantile))
+    def ask_of(self, quantile: float, share: float) -> None:
+        """State the share of the executions of a task, if the system is noisy, and of the tasks that are asked for."""
+        if (quantile, share) != (self.study.quantile, self.study.share):
+            self._use(self.study.fresh_copy(quantile, share))
 
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
         """Return what the completed trials, and unless ``alone`` other recordings teach; None if it is nothing."""
@@ -225,6 +225,7 @@ class CampaignDynamics:
         if learned is None and not ledger.spent_up:
             return None
         by, draws, replicates = self.thinking.search_settings, draws_for(confidence), 1
+        by = by if self.study.share == 1 else self.study.search.settings
         if learned is not None and learned.is_complete:
             replicates = 1 if learned.noisy is None else learned.noisy.replicates
             learned = learned.with_whole_search()
@@ -253,6 +254,7 @@ class CampaignDynamics:
             [self._allowed(trials), *((trial.number, trial.state, trial.distance, trial.note) for trial in trials)]
         )
         physical = "".join(f"{name} " for name in self.study.given.physical)
+        physical += "" if self.study.share == 1 else f"share {self.study.share} "
         return f"evidence {confidence} {self.study.quantile} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
     def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float, ledger: Ledger) -> Evidence:
@@ -276,6 +278,8 @@ class CampaignDynamics:
         # How many tests a verdict needs is not known here. Negligible errors are no function to search, nor to push.
         if evidence.negligible or is_open(evidence, "learning", "coverage", "tested", "explained", "search"):
             return evidence
+        if self.study.share < 1:  # no largest distance is searched
+            return replace(evidence, unvisited_region=learned.unvisited_region)
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         jump, further = learned.study.search.largest_jump(drawn_from), dict[str, Any]()
         further |= {"jump": jump, "unvisited_region": learned.unvisited_region}
@@ -355,6 +359,7 @@ class CampaignDynamics:
             best=Trials(trials).largest,
             worst=() if (largest := Trials(trials).worst) is None else tuple(largest.unit_point.tolist()),
             idle=tuple(learned.unseen_parameters),
+            share=self.study.share,
             **known,
         )
 
@@ -409,7 +414,7 @@ class CampaignDynamics:
         with contextlib.suppress(CertificateError):  # the certificate refuses the trials itself
             sample = replace(Sample.of(trials), suite=space.members)
             if kind.needs_evidence(sample):
-                self.use_quantile(kind.quantile)
+                self.ask_of(kind.quantile, kind.share)
                 evidence = self.evidence(trials, options.confidence)
                 return Learned(evidence, None if evidence is not None else self.failure)
         return Learned()

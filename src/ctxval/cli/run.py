@@ -47,6 +47,7 @@ def run(
     thinking: float | None = None,
     tests: int | None = None,
     quantile: float | None = None,
+    share: float | None = None,
     resolution: float | None = None,
     truth: bool = False,
     dask: str | None = None,
@@ -64,7 +65,7 @@ def run(
         "options": named_values(option),
     }
     settings = read_settings(target, {**vars(made), **vars(limits), **stated})
-    settings = settings.certified_as({"resolution": resolution, "tests": tests, "quantile": quantile})
+    settings = settings.certified_as({"resolution": resolution, "tests": tests, "quantile": quantile, "share": share})
     experiment, certificate = settings.load(), settings.certificate_options
     if (doubt := experiment.doubt_of_parameters) is not None:
         notes.say(doubt)

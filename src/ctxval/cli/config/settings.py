@@ -45,6 +45,7 @@ class CertificateTable(BaseModel, extra="allow"):
     tests: int = Field(default=TESTS, ge=0, strict=True)  #: executions at drawn tasks, predicted beforehand
     #: the share of the executions of each task that the verdict is about, if they differ by noise
     quantile: float = Field(default=QUANTILE, ge=0.5, lt=1, strict=True)
+    share: float = Field(default=1.0, ge=0.5, le=1, strict=True)  #: of the tasks that the verdict is about
     #: the largest distance between a task and its nearest trial, in diagonals of the task space
     resolution: float = Field(default=RESOLUTION, gt=0, allow_inf_nan=False, strict=True)
     discard: int | None = Field(default=None, ge=0)  #: the largest distances, for ``sampling-discarding``
