@@ -31,6 +31,7 @@ PAGES += sorted(DOCS.glob("reference/*.md"))
 NEEDS = {
     "gymnasium": ["gymnasium", "mujoco"],
     "mujoco": ["mujoco"],
+    "robot-knowledge": ["mujoco"],
     "fmu": ["fmpy", "pythonfmu"],
     "mpc": ["casadi", "do_mpc"],
 }
