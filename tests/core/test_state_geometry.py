@@ -7,10 +7,15 @@ import pytest
 
 from ctxval import Task, TaskSpace, Trajectory, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
+from ctxval._util.quaternions import product
 from ctxval.core.state_geometry import PLAIN, StateGeometry, geometry_of
 from ctxval.core.trajectory import Transitions
-from ctxval.learning.residual_data import residual_data
+from ctxval.errors import InputError, UnknownNameError
+from ctxval.learning.dynamics_posterior import learn_posterior
+from ctxval.learning.residual_data import InvarianceWarning, residual_data
 from ctxval.models import Corrected
+from ctxval.models.mujoco import proposed_invariant
+from facts import refuses
 
 FREE = StateGeometry((3, 8))  # a free joint, a hinge and a ball joint
 MJCF = """<mujoco><option timestep="0.005"/><worldbody><body pos="0 0 1"><freejoint/>
@@ -139,3 +144,96 @@ def test_recorded_quaternions_of_any_sign_are_accepted() -> None:
     plain, flipping = (validation(each).outcome([0.7]) for each in (system, Flipping()))
     assert plain.distance == flipping.distance > 1e-4
     assert np.array_equal(plain.system_trajectory.states, flipping.system_trajectory.states)
+
+
+# Invariance
+
+DRONE = """<mujoco><option timestep="0.02"{wind}/><worldbody><body pos="0 0 1"><freejoint/>
+  <inertial pos="{offset} 0 0" mass="1" diaginertia="0.02 0.03 0.04"/><site name="hub"/></body></worldbody>
+  <actuator><motor site="hub" gear="0 0 1 0 0 0"/><motor site="hub" gear="0 0 0 0 1 0"/></actuator></mujoco>"""
+ELSEWHERE = ["x", "y", "yaw"]
+
+
+def elsewhere(x: Array, angle: float) -> Array:
+    """Return states (N, 13) of a free joint at another place, turned about the vertical axis."""
+    moved, turn = np.array(x), np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    moved[:, :2] = x[:, :2] @ turn.T + [3.0, -2.0]
+    moved[:, 7:9] = x[:, 7:9] @ turn.T
+    half = np.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
+    moved[:, 3:7] = product(np.broadcast_to(half, x[:, 3:7].shape), x[:, 3:7])
+    return moved
+
+
+def flights(count: int, yaw: float, seed: int = 0) -> tuple[Array, Array]:
+    """Return states and inputs of a drone that heads to about one yaw angle."""
+    rng = np.random.default_rng(seed)
+    x = np.concatenate(
+        [rng.normal(size=(count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), rng.normal(size=(count, 6))], 1
+    )
+    turn = np.concatenate([np.zeros((count, 4)), 0.2 * rng.normal(size=(count, 2)), np.zeros((count, 7))], axis=1)
+    return elsewhere(StateGeometry((3,)).add(x, turn), yaw), rng.normal([9.81, 0.0], [3.0, 0.3], (count, 2))
+
+
+def test_features_and_what_is_missed_do_not_change_elsewhere() -> None:
+    pytest.importorskip("mujoco")
+    model = models.MuJoCo(DRONE.format(offset=0, wind=""), invariant=ELSEWHERE)
+    geometry = geometry_of(model)
+    assert geometry == StateGeometry((3,), (0, 1), (0, 7))
+    x, u = flights(50, 0.0)
+    for angle in (0.0, 1.0, 3.0, -2.5):
+        there = elsewhere(x, angle)
+        assert np.abs(geometry.features(there) - geometry.features(x)).max() < 1e-12
+        reached, predicted = x + 0.01, model.step(x, u)
+        missed = geometry.missed(reached, predicted, x)
+        assert np.abs(geometry.missed(elsewhere(reached, angle), model.step(there, u), there) - missed).max() < 1e-12
+        again = geometry.corrected(model.step(there, u), missed, there)
+        assert np.abs(geometry.difference(again, elsewhere(reached, angle))).max() < 1e-12
+    assert not geometry.features(x)[:, :2].any()
+
+
+def test_what_was_learned_at_one_yaw_holds_at_another() -> None:
+    """A drone with a centre of mass elsewhere: its error at yaw 2.5 is predicted from flights at yaw 0."""
+    pytest.importorskip("mujoco")
+    system, left = models.MuJoCo(DRONE.format(offset=0.05, wind="")), []
+    for invariant in (ELSEWHERE, []):
+        model = models.MuJoCo(DRONE.format(offset=0, wind=""), invariant=invariant)
+        x, u = flights(150, 0.0)
+        posterior = learn_posterior(model, Transitions(x, u, system.step(x, u)), np.zeros(150, dtype=np.intp))
+        assert posterior is not None
+        assert posterior.data.recorded[:, :2].any() == (not invariant)  # so records need not cover places
+        x, u = flights(60, 2.5, 1)
+        geometry, reached = StateGeometry((3,)), system.step(x, u)
+        errors = [geometry.difference(reached, each.step(x, u)) for each in (posterior.mean, model)]
+        left.append(np.sqrt((errors[0] ** 2).sum() / (errors[1] ** 2).sum()))
+    assert left[0] < 0.01 < 0.1 < left[1]
+
+
+def test_executions_may_contradict_invariance() -> None:
+    """Wind blows in one direction of the world, so that the error depends on where the drone heads."""
+    pytest.importorskip("mujoco")
+    system = models.MuJoCo(DRONE.format(offset=0, wind=' gravity="1.5 0 -9.81"'))
+    model = models.MuJoCo(DRONE.format(offset=0, wind=""), invariant=ELSEWHERE)
+    parts = [flights(40, yaw, k) for k, yaw in enumerate(np.linspace(-3, 3, 5))]
+    x, u = (np.concatenate(each) for each in zip(*parts, strict=True))
+    with pytest.warns(InvarianceWarning):
+        posterior = learn_posterior(model, Transitions(x, u, system.step(x, u)), np.zeros(200, dtype=np.intp))
+    assert posterior is not None
+    assert posterior.data.geometry == StateGeometry((3,))
+
+
+def test_invariant_states_are_named() -> None:
+    pytest.importorskip("mujoco")
+    assert geometry_of(models.MuJoCo(DRONE.format(offset=0, wind=""), invariant=["y"])).invariant == (1,)
+    plane = '<worldbody><geom type="plane" size="1 1 1" euler="{} 0 0"/>'
+    for tilt, proposed in ((0, ("x", "y", "yaw")), (5, ())):
+        ground = DRONE.format(offset=0, wind="").replace("<worldbody>", plane.format(tilt))
+        assert proposed_invariant(models.MuJoCo(ground).compiled) == proposed
+    assert proposed_invariant(models.MuJoCo(DRONE.format(offset=0, wind=' gravity="1 0 -9"')).compiled) == ()
+    rail = DRONE.replace("<freejoint/>", '<joint name="rail" type="slide"/>').format(offset=0, wind="")
+    assert geometry_of(models.MuJoCo(rail, invariant=["rail"])) == StateGeometry(invariant=(0,))
+    with refuses(UnknownNameError, "x", "rail"):
+        models.MuJoCo(rail, invariant=["x"])
+    with refuses(InputError, "yaw"):
+        models.MuJoCo(DRONE.format(offset=0, wind=""), invariant=["yaw"])
+    with refuses(InputError, "sites"):
+        models.MuJoCo(DRONE.format(offset=0, wind=""), invariant=["x", "y"], sites="hub")

@@ -97,7 +97,7 @@ class DryFriction:
             force = self._force(x, u, reached + residuals, effects, force)
             residuals = missed(u - force)
         force = self._force(x, u, reached + residuals, effects, force)
-        following = geometry_of(self.model).add(reached, residuals)
+        following = geometry_of(self.model).corrected(reached, residuals, x)
         return np.asarray(following - (effects * force[..., None, :]).sum(axis=-1))
 
     def _force(self, x: Array, u: Array, reached: Array, effects: Array, force: Array) -> Array:

@@ -86,7 +86,7 @@ def rest_of(
     source = np.repeat(np.arange(len(steps)), [len(each) for each in steps])
     geometry = geometry_of(model)
     with np.errstate(all="ignore"):
-        errors = np.concatenate([geometry.difference(each.x_next, predicted_steps(model, each)) for each in steps])
+        errors = np.concatenate([geometry.missed(each.x_next, predicted_steps(model, each), each.x) for each in steps])
     x, u = (np.concatenate([getattr(each, name) for each in steps]) for name in ("x", "u"))
     if not (finite := np.isfinite(errors).all(axis=1)).any():
         return None
@@ -163,10 +163,10 @@ class ParametricDraws(DrawsWithoutNoise):
         following, of_model = advanced(self._drawn, each, inputs, of_model)
         if self.weights.any():
             missed = self.rest.features(each, inputs, before) @ self.weights
-            following = self.rest.geometry.add(following, missed)
+            following = self.rest.geometry.corrected(following, missed, each)
         if self.rows.shape[1]:
             at = self.rows[np.arange(len(self)), int(step[0, 0, 0]) % self.rows.shape[1]]
-            following = self.rest.geometry.add(following, self.rest.rests[at][:, None])
+            following = self.rest.geometry.corrected(following, self.rest.rests[at][:, None], each)
         memory = np.concatenate([step + 1, inputs, of_model], axis=-1).reshape(memory.shape)
         return np.asarray(following).reshape(x.shape), memory
 

@@ -123,7 +123,7 @@ class Corrected(ShortRepr):
 
     def _corrected(self, x: Array, u: Array, x_next: Array) -> Array:
         geometry = geometry_of(self.model)
-        return geometry.add(x_next, self.correction(geometry.features(x), u))
+        return geometry.corrected(x_next, self.correction(geometry.features(x), u), x)
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return A ``(..., n, n)`` and B ``(..., n, m)``, without batch axes if they are those of a linear model M."""

@@ -26,6 +26,8 @@ from ctxval.learning import DynamicsStudy
 from ctxval.learning.extended import with_states_of_model
 from ctxval.learning.sensitivity import found_sensitivity
 from ctxval.learning.stage_costs import Speed, Thinking, ThinkingSettings
+from ctxval.models import MuJoCo
+from ctxval.models.mujoco import proposed_invariant
 from ctxval.specs import Specification
 from ctxval.studies.aspect1 import Aspect1Report
 from ctxval.testing import check_distance, check_model, check_synthesizer
@@ -186,6 +188,10 @@ def _model(validation: Validation, counts: Mapping[str, int]) -> Findings:
     except ConformanceError:
         check_model(validation.model, **counts, tolerance=1e-5)
         yield "noted", "its results for batches and single states agree only to single precision"
+    if isinstance(model := validation.model, MuJoCo) and not model.sites and not model.geometry.invariant:
+        proposed = list(proposed_invariant(model.compiled))
+        if proposed:
+            yield "noted", f"if the ground of S is flat, invariant = {proposed} lets fewer executions teach M's error"
 
 
 def _small_changes(validation: Validation) -> Findings:
