@@ -78,10 +78,11 @@ docs: .venv/.test  ## the manual, with its gallery; writes docs/_build/html, and
 frozen: .venv/.test  ## do stored campaigns still end and choose as they did? Nothing is executed
 	$(BIN)/python benchmarks/frozen_replay.py --workers 2
 
-pictures: .venv/.test  ## those of the README and of the manual; needs Chromium
+pictures: .venv/.test  ## those of the README and of the manual; needs Chromium and EGL
 	$(BIN)/ctxval run pendulum --search gp-ucb --seed 1 --store docs/pictures/pendulum.sqlite --no-report
 	rm docs/pictures/pendulum.sqlite
 	$(BIN)/python benchmarks/report_picture.py
+	$(BIN)/python benchmarks/robot_picture.py
 
 calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/calibration.md, and resumes
 	$(BIN)/python benchmarks/calibrate.py --campaigns $(CAMPAIGNS)
