@@ -23,6 +23,7 @@ from ctxval.certificates.predictions import mostly_fail
 from ctxval.certificates.sample import SAME, Sample
 from ctxval.certificates.sentences.statements import EXECUTED_AGAIN, INDEPENDENT_REPEATS
 from ctxval.certificates.sentences.verdicts import supported as supported_by
+from ctxval.certificates.task_share import Share
 from ctxval.core.quantiles import QUANTILE
 from ctxval.errors import CertificateError
 
@@ -101,6 +102,7 @@ class Automatic(CertificateKind):
     resolution: PositiveFloat = RESOLUTION  #: as for the posterior bound
     tests: NonNegativeInt = TESTS  #: executions at drawn tasks; those for learned dynamics must be predicted beforehand
     quantile: Probability = QUANTILE  #: the share of the executions of each task that a bound with noise is about
+    share: Share = 1.0  #: the share of the tasks that the bound is about; 1 for the largest distance
 
     def needs_evidence(self, sample: Sample) -> bool:
         """Return whether the dynamics bound is tried: a resolution of one's own asks for the posterior bound."""
@@ -116,6 +118,8 @@ class Automatic(CertificateKind):
         """
         threshold = sample.threshold
         uses_dynamics = sample.learned is not None and self.needs_evidence(sample)
+        if self.share < 1:  # no other kind bounds the distances of a share of the tasks
+            return Dynamics(tests=self.tests, quantile=self.quantile, share=self.share).certify(sample, confidence)
         if sample.suite is not None and not uses_dynamics:
             return WholeSuite(self.quantile).certify(sample, confidence)
         by_dynamics = None

@@ -12,6 +12,7 @@ import scipy
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
+from ctxval.core.state_geometry import geometry_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.effects.effect import Effect, EffectCandidate
 from ctxval.learning.effects.flow import Linearisation
@@ -59,7 +60,7 @@ class Segments:
         numbers: Sequence[int] | None = None,
     ) -> None:
         self.numbers: Rows = np.array(range(len(runs)) if numbers is None else numbers)  # of the executions
-        self.settings = settings
+        self.settings, self._geometry = settings, geometry_of(model)
         self.model, self.known, self.horizons = model, known, [len(run.inputs) for run in runs]
         self.states = np.concatenate([run.states for run in runs])
         self.inputs = np.zeros((len(runs), max(self.horizons), runs[0].inputs.shape[1]))
@@ -70,7 +71,7 @@ class Segments:
         for number, length in enumerate(settings.steps):
             window = self._window(min(length, min(self.horizons)), most[number])
             left = self.left_by(ModelWithEffects(model, ()), window)
-            changes = _size(self._gap(self.states[window.states + window.steps] - self.states[window.states]))
+            changes = _size(self._gap(self.states[window.states + window.steps], self.states[window.states]))
             # Smaller residuals are no segments.
             least = np.hypot(0.01 * _size(left), 1e-3 * changes) if floors is None else floors[number]
             self.windows.append(replace(window, floors=np.maximum(least, 1e-15)))
@@ -113,15 +114,16 @@ class Segments:
         acting = repaired.in_run(self.numbers).acting(np.broadcast_to(self.inputs, (*draws, *self.inputs.shape)))
         repaired = repaired.in_run(window.runs)
         acting = acting.reshape(*draws, -1, *acting.shape[len(draws) + 2 :])
-        begun = self.states[window.states] + moved
+        begun = self._geometry.add(self.states[window.states], np.zeros(self.states.shape[1]) + moved)
         x = repaired.true(np.broadcast_to(begun, (*draws, *begun.shape)))
         moved_back = any(type(effect).true is not Effect.true for effect in repaired.effects)
         for k in range(window.steps):
             at = None if moved_back else self.linearised[window.states + k]
             x = repaired.reached(x, acting.take(window.inputs + k, axis=len(draws)), at)
-        return self._gap(repaired.recorded(x) - self.states[window.states + window.steps])
+        return self._gap(repaired.recorded(x), self.states[window.states + window.steps])
 
-    def _gap(self, difference: Array) -> Array:
+    def _gap(self, states: Array, others: Array) -> Array:
+        difference = self._geometry.difference(states, others)
         return functools.reduce(lambda difference, effect: effect.gap(difference), self.known, difference)
 
     def noise(self, repaired: ModelWithEffects) -> Array:
@@ -159,7 +161,7 @@ class Segments:
         settings = self.settings
         window, rng = self._window(steps, len(self.states)), np.random.default_rng(0)
         if steps not in self._missed:
-            changes = _size(self._gap(self.states[window.states + steps] - self.states[window.states]))
+            changes = _size(self._gap(self.states[window.states + steps], self.states[window.states]))
             missed = _size(self.left_by(ModelWithEffects(self.model, ()), window))
             self._missed[steps] = missed, missed > 2e-3 * np.maximum(changes, 1e-12)
         sizes, matter = self._missed[steps]
