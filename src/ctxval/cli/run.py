@@ -104,6 +104,7 @@ def run(
         report |= {"budget": total, "units": experiment.units, **_summary(campaign, verdict, bound, known)}
         report |= {"store": str(path), "other_stores": [str(other.path) for other in other_stores(path)]}
         report |= {"options": settings.options} if settings.options else {}
+        report |= {} if campaign.sensitivity is None else {"sensitivity": campaign.sensitivity.to_json()}
         trusted = None
         if envelope and limit is not None:
             trusted = campaign.envelope(limit, certificate.confidence, certificate=certificate)
