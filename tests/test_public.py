@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import inspect
 import re
 import subprocess
 import sys
@@ -77,6 +78,32 @@ def test_everything_public_has_a_docstring(name: str) -> None:
     assert (getattr(ctxval, name).__doc__ or "").strip()
 
 
+def arrays_without_shapes(name: str) -> list[str]:
+    """Return the public functions and methods that take or return arrays, and whose docstrings have no shape."""
+    made = getattr(ctxval, name) if name in ctxval.__all__ else None
+    places = [(name, made)] if made is not None else [*vars(importlib.import_module(f"ctxval.{name}")).items()]
+    without = []
+    for label, public in places:
+        where = getattr(public, "__module__", None) or ""
+        ours = where.startswith(f"ctxval.{name}" if made is None else "ctxval") and not label.startswith("_")
+        methods = vars(public).items() if ours and isinstance(public, type) else [(label, public)] if ours else []
+        for method, function in methods:
+            plain = inspect.unwrap(getattr(function, "__func__", None) or getattr(function, "fget", None) or function)
+            if method.startswith("_") or not inspect.isfunction(plain) or not plain.__doc__:
+                continue  # contracts document what has no docstring of its own
+            texts = plain.__doc__ + (public.__doc__ or "")
+            if re.search("Array", str(plain.__annotations__)) and not re.search(r"``[^`]*\(|``[SNd]``|shape", texts):
+                without.append(f"{label}.{method}")
+    return without
+
+
+@pytest.mark.parametrize(
+    "name", [*ctxval.__all__, *(name for name in ctxval._MODULES if name not in ("cases", "plot"))]
+)
+def test_docstrings_of_arrays_have_shapes(name: str) -> None:
+    assert not arrays_without_shapes(ctxval._MODULES.get(name, name))
+
+
 def test_every_error_is_drawn_in_the_tree_and_derives_from_one_base() -> None:
     classes = [v for v in vars(errors).values() if isinstance(v, type) and issubclass(v, Exception)]
     for error in classes:
@@ -111,7 +138,8 @@ def test_every_extra_that_is_named_exists() -> None:
 def test_all_brings_every_extra_and_each_is_used() -> None:
     given = extras()
     brought = set(re.findall(r"[a-z]+", given["all"][0].partition("[")[2]))
-    assert brought == set(given) - {"all", "test", "docs", "dev", "torch"}  # torch is too large to come along
+    # Robots are two others, and torch is too large to come along.
+    assert brought == set(given) - {"all", "test", "docs", "dev", "robots", "torch"}
     source = "".join(file.read_text() for file in (ROOT / "src").rglob("*.py"))
     imported = {
         "scikit-learn": "sklearn",

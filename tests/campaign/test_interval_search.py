@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import rig_suites
 from conftest import interrupt_at_once, make_validation, make_validation_without_inputs
 from ctxval import (
     Campaign,
@@ -45,6 +46,7 @@ from ctxval.certificates import (
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, hypercube_in, share_missed
+from ctxval.certificates.task_share import PREDICTED_ABOVE
 from ctxval.core.coverage import UntestedRest, UnvisitedRegion
 from ctxval.errors import InputError
 from ctxval.learning import dynamics_study
@@ -520,3 +522,44 @@ def test_a_distance_with_kinks_may_be_large_next_to_executed_tasks() -> None:
     for distance, is_new in ((distances.UnsafeMargin(spec), True), (distances.FinalState(), False)):
         search = IntervalSearch(Campaign(make_validation(distance=distance)).recorder, CertificateOptions(), 10)
         assert (search._near < np.abs(known - 0.51).max()) == is_new
+
+
+def shared(factor: float) -> tuple[Campaign, float]:
+    """Run a campaign on 99 % of the tasks of the pendulum; return it and the threshold."""
+    validation = cases.by_name("pendulum").validation
+    distances = validation.distances(validation.space.iid(3000, np.random.default_rng(3)))
+    threshold = factor * float(np.quantile(distances, 0.99))
+    return Campaign(validation).run(20, threshold, share=0.99), threshold
+
+
+@pytest.mark.slow
+def test_a_share_of_the_tasks_is_validated_by_independent_tests_and_resumes() -> None:
+    campaign, threshold = shared(1.25)
+    verdict = campaign.verdict(threshold, share=0.99)
+    assert verdict.answer == "validated"
+    assert verdict.certificate is not None
+    assert verdict.certificate.volume == pytest.approx(0.01)
+    assert verdict.bound is None
+    assert Counter(trial.origin for trial in campaign.trials)["iid"] == TESTS
+    again = Campaign(campaign.validation)
+    again.run(5, threshold, share=0.99)
+    again.run(20, threshold, share=0.99)
+    assert facts(again) == facts(campaign)
+
+
+@pytest.mark.slow
+def test_a_share_of_the_tasks_is_falsified_by_tasks_drawn_where_more_is_predicted() -> None:
+    campaign, threshold = shared(0.9)
+    verdict = campaign.verdict(threshold, share=0.99)
+    assert verdict.answer == "falsified"
+    drawn = [trial for trial in campaign.trials if PREDICTED_ABOVE in (trial.note or {})]
+    assert 2 <= len(drawn) <= 4
+    assert campaign.trials[-1] in drawn
+    assert campaign.verdict(threshold, share=0.8).answer != "falsified"
+
+
+def test_no_share_is_asked_of_a_suite() -> None:
+    with pytest.raises(InputError):
+        Campaign(rig_suites.validation()).run(2, 1.0, share=0.9)
+    with pytest.raises(InputError):
+        Campaign(make_validation()).run(2, 1.0, share=0.9, envelope=True)

@@ -19,14 +19,18 @@ from ctxval import (
     distances,
     load_experiment,
     models,
+    searches,
     systems,
 )
+from ctxval.certificates.automatic import WholeSuite
+from ctxval.certificates.options import CertificateOptions
+from ctxval.certificates.sample import Sample
 from ctxval.cli.config.check import check_experiment
 from ctxval.core.trajectory import COMPLETE
 from ctxval.data import LogMapping
 from ctxval.data.recorded_system import RecordedInputsWarning
 from ctxval.errors import ExecutionError, InputError
-from facts import refuses, warns
+from facts import assert_names, refuses, warns
 
 TIMES = 0.1 * np.arange(6)
 RUN = Trajectory(TIMES, np.stack([TIMES, 2 * TIMES], axis=-1), np.ones((5, 1)))
@@ -168,3 +172,74 @@ def test_recorded_inputs_take_batches_of_draws() -> None:
     recorded = systems.Recorded({"lift": RUN})
     controller = recorded.design(task("lift"), models.Linear([[1.0]], [[1.0]]))
     assert controller(2, np.zeros((4, 3, 2))).shape == (4, 3, 1)
+
+
+RANDOM = searches.by_name("random")
+
+
+def noisy_lift(count: int) -> dict[str, list[Trajectory]]:
+    """Return recordings of two tasks whose distances to the model of ``repeated`` are 0 to 1, and 0 to 0.5."""
+    rng, runs = np.random.default_rng(0), dict[str, list[Trajectory]]()
+    for name, size in (("lift", 1.0), ("drop", 0.5)):
+        ends = size * rng.random(count)
+        runs[name] = [Trajectory(TIMES, np.linspace([0, 0], [end, 0], 6), np.ones((5, 1))) for end in ends]
+    return runs
+
+
+def repeated(runs: dict[str, list[Trajectory]]) -> Validation:
+    recorded = systems.Recorded(runs)
+    return Validation(
+        space=TaskSuite(list(runs), repeats=recorded.repeats),
+        task=lambda p: Task([0.0, 0.0], horizon=5, dt=0.1),
+        system=recorded,
+        model=models.Linear(np.eye(2), np.zeros((2, 1))),
+        synthesizer=recorded,
+        distance=distances.FinalState(),
+    )
+
+
+def test_recordings_of_one_task_are_executed_in_turn_also_after_a_break(tmp_path: Path) -> None:
+    runs = noisy_lift(3)
+    Campaign(repeated(runs), search=RANDOM, store=tmp_path / "a.sqlite").run(3)
+    campaign = Campaign(repeated(runs), search=RANDOM, store=tmp_path / "a.sqlite").run(20)
+    assert [sorted({t.parameters["task"] for t in campaign.trials[k : k + 2]}) for k in (0, 2, 4)] == [
+        ["drop", "lift"]
+    ] * 3
+    for name, recordings in runs.items():
+        found = [trial.distance for trial in campaign.trials if trial.parameters["task"] == name]
+        assert found == [abs(float(run.states[-1, 0])) for run in recordings]
+    assert not campaign.recorder.has_tasks
+    with refuses(ExecutionError, "lift", 3):
+        systems.Recorded(runs).execute(constant, task("lift").again(3))
+    folder = tmp_path / "logs"
+    for name in ("lift", "drop"):
+        (folder / name).mkdir(parents=True)
+        folder_with(folder / name, "a", "b")
+    assert systems.Recorded(folder, MAPPING).repeats == 2
+
+
+def test_a_quantile_needs_as_many_repeats_as_the_binomial_law_says() -> None:
+    # With two tasks, each has half of the 5 % by which the statement may be wrong.
+    options = CertificateOptions(WholeSuite(quantile=0.9), 0.95)
+    few = Campaign(repeated(noisy_lift(10)), search=RANDOM).run(20, 2.0, certificate=options)
+    verdict = few.verdict(2.0, certificate=options)
+    assert (len(few.trials), verdict.answer) == (20, "undecided")
+    assert_names(verdict.reason, 10, 36, 90, f"{100 * 0.025 ** (1 / 10):.3g}")
+    less = CertificateOptions(WholeSuite(quantile=0.69), 0.95)
+    assert few.verdict(2.0, certificate=less).answer == "validated"
+    many = Campaign(repeated(noisy_lift(50)), search=RANDOM).run(100, 2.0, certificate=options)
+    verdict = many.verdict(2.0, certificate=options)
+    assert verdict.answer == "validated"
+    assert verdict.certificate is not None
+    assert verdict.certificate.details["repeats"] == 36  # no more are executed than needed
+    # Of 50, not the largest is the bound of one task but the second one: P(Bin(50, 0.9) <= 48) >= 0.95.
+    values = np.random.default_rng(1).random(50)
+    sample = Sample(np.zeros((50, 1)), values, ["manual"] * 50, ["completed"] * 50, suite=np.zeros((1, 1)), repeats=50)
+    assert WholeSuite(quantile=0.9).certify(sample).upper_bound == np.sort(values)[-2]
+
+
+def test_repeats_above_a_threshold_falsify_it_by_bets() -> None:
+    campaign = Campaign(repeated(noisy_lift(50)), search=RANDOM).run(100, 0.3)
+    verdict = campaign.verdict(0.3)
+    assert verdict.answer == "falsified"
+    assert sum((trial.distance or 0.0) > 0.3 for trial in campaign.trials) > 1

@@ -26,6 +26,7 @@ from ctxval._util.progress import progress_shown, stage
 from ctxval._util.representation import call
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
+from ctxval.campaign.dynamics import SENSITIVITY
 from ctxval.campaign.envelope import EnvelopeSearch
 from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.executors import Executor, worker_pool
@@ -51,6 +52,7 @@ from ctxval.core.trial import Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError, CtxvalError, InputError
 from ctxval.gp.surrogate import Surrogate, fit_surrogate
+from ctxval.learning.sensitivity import Sensitivity
 from ctxval.searches import Auto, Search
 
 if TYPE_CHECKING:
@@ -154,6 +156,12 @@ class Campaign:
         """The completed trial with the largest distance."""
         return self.trials.worst
 
+    @property
+    def sensitivity(self) -> Sensitivity | None:
+        """How far small changes move closed loops of M if these are not smooth, as found before the first execution."""
+        notes = (trial.note or {} for trial in self.trials[:1])
+        return next((Sensitivity.from_json(note.get(SENSITIVITY)) for note in notes), None)
+
     def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
         """Return the trajectories of the model and of the system in a trial; None if a trajectory is not stored.
 
@@ -196,6 +204,7 @@ class Campaign:
         confidence: float = CONFIDENCE,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
+        share: float = 1.0,
         until: Callable[[Campaign], bool] | None = None,
         again: str | None = None,
         workers: PositiveInt | None = None,
@@ -229,7 +238,7 @@ class Campaign:
                 which the distance stays below the threshold; see :meth:`envelope`.
             within: without a threshold, the share by which the bound may exceed the largest executed distance at the
                 end.
-            confidence, resolution, certificate: as in :meth:`verdict`; unless the campaign explores, the
+            confidence, resolution, certificate, share: as in :meth:`verdict`; unless the campaign explores, the
                 kind of the certificate must be ``auto``, ``dynamics``, ``posterior`` or, with an acceptable volume,
                 ``anytime``.
             until: called before each execution; the campaign stops early if it returns True.
@@ -254,7 +263,7 @@ class Campaign:
                 executions are stored, and running again continues after the trial that failed.
             CampaignError: if there are no workers any more.
         """
-        options = CertificateOptions.or_automatic(certificate, confidence, resolution)
+        options = CertificateOptions.or_automatic(certificate, confidence, resolution, share)
         if explore is None:
             explore = threshold is None and not isinstance(self.search, Auto)
         decides = None if explore else IntervalSearch(self.recorder, options, budget, threshold, within)
@@ -290,6 +299,8 @@ class Campaign:
             self.state_threshold(threshold)
         predicts = decides is not None and decides.predicts
         with self.recorder.predicting(predicts, thinking), progress_shown(progress):
+            if predicts and not self.trials and options.kind.share == 1:
+                self.recorder.dynamics.find_sensitivity(threshold)
             ExecutionLoop(
                 self.recorder,
                 rule,
@@ -529,7 +540,9 @@ class Campaign:
         """
         known, judged = self.provenance, self.recorder.trials if trials is None else trials
         kind, confidence = options.kind, options.confidence
-        if threshold is not None and counterexample(judged, threshold, known.quantities, confidence, kind.quantile):
+        if threshold is not None and counterexample(
+            judged, threshold, known.quantities, confidence, kind.quantile, kind.share
+        ):
             return known
         return replaced(known, learned=self.recorder.dynamics.learned_for(judged, options))
 
@@ -551,6 +564,7 @@ class Campaign:
         *,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
+        share: float = 1.0,
         thinking: TimeLimit | None = None,
         progress: bool | None = None,
     ) -> Verdict:
@@ -565,14 +579,17 @@ class Campaign:
             confidence: the confidence level of the certificate, at least 0.5.
             resolution: the largest distance between a task and its nearest trial that a validation permits, in
                 diagonals of the task space.
-            certificate: the kind and the options of the certificate, in place of ``auto`` with the two options above.
+            certificate: the kind and the options of the certificate, in place of ``auto`` with the other options.
+            share: the share of the tasks that must stay below the threshold, from 0.5 to 1. With less than 1, the model
+                is falsified if executions at drawn tasks prove that more of them exceed it.
             thinking: as in :meth:`run`. If its evidence needs more, the verdict is undecided with the code ``no_time``.
             progress: as in :meth:`run`.
 
         Raises:
             CertificateError: if an option of the certificate is not valid.
         """
-        options, recorder = CertificateOptions.or_automatic(certificate, confidence, resolution), self.recorder
+        options = CertificateOptions.or_automatic(certificate, confidence, resolution, share)
+        recorder = self.recorder
         self.state_threshold(threshold)
         recorder.dynamics.shortage = None
         with progress_shown(progress), stage("certifying"), recorder.dynamics.thinking.limited(thinking):
@@ -590,13 +607,14 @@ class Campaign:
         *,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
+        share: float = 1.0,
         progress: bool | None = None,
     ) -> Certificate:
         """Return the bound on d*, which needs no threshold. The arguments are those of :meth:`verdict`.
 
         A CertificateError is raised if the theory of the certificate refuses the trials.
         """
-        options = CertificateOptions.or_automatic(certificate, confidence, resolution)
+        options = CertificateOptions.or_automatic(certificate, confidence, resolution, share)
         with progress_shown(progress), stage("certifying"):
             certified = assess(self.trials, options, provenance=self.provenance_for(options)).certificate
         assert certified is not None  # without a threshold, a refusal is raised

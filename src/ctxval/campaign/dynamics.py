@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -33,11 +34,13 @@ from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.coverage import unsampled_corner
 from ctxval.learning.prediction import Executed
+from ctxval.learning.sensitivity import Sensitivity, found_sensitivity
 from ctxval.learning.stage_costs import Ledger
 from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
 
+SENSITIVITY = "sensitivity"  #: key of a :class:`Sensitivity` in the note of the first trial
 PREDICTION = "prediction"  #: key of the prediction of an execution in the note of its trial
 NEAR = 0.02  #: a task that differs from an executed one by less than this in every coordinate is no new one
 
@@ -48,6 +51,10 @@ def prediction_in(note: Mapping[str, Any] | None) -> ExecutionPrediction | None:
     """Return the prediction of an execution in the note of its trial, of whichever distance; None if there is none."""
     stored = (note or {}).get(PREDICTION)
     return ExecutionPrediction.from_json(stored) if isinstance(stored, dict) else None
+
+
+class SensitivityWarning(UserWarning):
+    """Closed loops on M are not smooth, so that the largest distance over the tasks is no stable number."""
 
 
 class CampaignDynamics:
@@ -69,6 +76,7 @@ class CampaignDynamics:
         self._store = store
         self.extra_recordings: Callable[[], Sequence[Trajectory]] = tuple
         self.failure: str | None = None
+        self.sensitivity: Sensitivity | None = None  #: of M, if its closed loops are not smooth
         self.shortage: TimeShortage | None = None  #: why the last verdict has no evidence; None if it has some
         self._use(DynamicsStudy(validation, seed))
         manual = bool(getattr(validation.system, "manual", False))
@@ -80,10 +88,10 @@ class CampaignDynamics:
         # Predictions that no store has, by their trials: each verdict checks those of the last trials.
         self._afterwards: Latest[Any, ExecutionPrediction | None] = Latest(2 * LIMITS.predictions)
 
-    def use_quantile(self, quantile: float) -> None:
-        """State the share of the executions of a task that distances are about, if the system is noisy."""
-        if quantile != self.study.quantile:
-            self._use(self.study.fresh_copy(quantile))
+    def ask_of(self, quantile: float, share: float) -> None:
+        """State the share of the executions of a task, if the system is noisy, and of the tasks that are asked for."""
+        if (quantile, share) != (self.study.quantile, self.study.share):
+            self._use(self.study.fresh_copy(quantile, share))
 
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
         """Return what the completed trials, and unless ``alone`` other recordings teach; None if it is nothing."""
@@ -121,7 +129,22 @@ class CampaignDynamics:
     def note(self, trials: Sequence[Trial]) -> dict[str, Any]:
         """Return what the next trial stores of the thinking on its task; empty without a budget."""
         note = self.thinking.note(trials, self.ledger(trials) if trials else Ledger())
-        return {} if note is None else {THINKING: note}
+        found = {} if trials or self.sensitivity is None else {SENSITIVITY: self.sensitivity.to_json()}
+        return found if note is None else {THINKING: note, **found}
+
+    def find_sensitivity(self, threshold: float | None) -> None:
+        """Warn if small changes of M change distances as far as matters to a threshold; the first trial stores it.
+
+        Nothing is found without a budget of thinking, or if it does not suffice.
+        """
+        self.thinking.measure(())
+        thinking = self.thinking.after(())
+        if thinking is not None:
+            with contextlib.suppress(Exception):  # users' parts
+                self.sensitivity = found_sensitivity(self.study.planner, thinking, threshold)
+        if self.sensitivity is not None:
+            units = self.study.given.labels.units
+            warnings.warn(self.sensitivity.in_words(units), SensitivityWarning, stacklevel=2)
 
     def _allowed(self, trials: Sequence[Trial]) -> float:
         """Return the distance that is negligible beside all stated thresholds; 0 if executed ones are larger."""
@@ -225,6 +248,7 @@ class CampaignDynamics:
         if learned is None and not ledger.spent_up:
             return None
         by, draws, replicates = self.thinking.search_settings, draws_for(confidence), 1
+        by = by if self.study.share == 1 else self.study.search.settings
         if learned is not None and learned.is_complete:
             replicates = 1 if learned.noisy is None else learned.noisy.replicates
             learned = learned.with_whole_search()
@@ -253,6 +277,7 @@ class CampaignDynamics:
             [self._allowed(trials), *((trial.number, trial.state, trial.distance, trial.note) for trial in trials)]
         )
         physical = "".join(f"{name} " for name in self.study.given.physical)
+        physical += "" if self.study.share == 1 else f"share {self.study.share} "
         return f"evidence {confidence} {self.study.quantile} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
     def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float, ledger: Ledger) -> Evidence:
@@ -276,6 +301,8 @@ class CampaignDynamics:
         # How many tests a verdict needs is not known here. Negligible errors are no function to search, nor to push.
         if evidence.negligible or is_open(evidence, "learning", "coverage", "tested", "explained", "search"):
             return evidence
+        if self.study.share < 1:  # no largest distance is searched
+            return replace(evidence, unvisited_region=learned.unvisited_region)
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         jump, further = learned.study.search.largest_jump(drawn_from), dict[str, Any]()
         further |= {"jump": jump, "unvisited_region": learned.unvisited_region}
@@ -355,6 +382,7 @@ class CampaignDynamics:
             best=Trials(trials).largest,
             worst=() if (largest := Trials(trials).worst) is None else tuple(largest.unit_point.tolist()),
             idle=tuple(learned.unseen_parameters),
+            share=self.study.share,
             **known,
         )
 
@@ -409,7 +437,7 @@ class CampaignDynamics:
         with contextlib.suppress(CertificateError):  # the certificate refuses the trials itself
             sample = replace(Sample.of(trials), suite=space.members)
             if kind.needs_evidence(sample):
-                self.use_quantile(kind.quantile)
+                self.ask_of(kind.quantile, kind.share)
                 evidence = self.evidence(trials, options.confidence)
                 return Learned(evidence, None if evidence is not None else self.failure)
         return Learned()

@@ -66,6 +66,8 @@ class EnvelopeSearch:
         kind = interval.options.kind
         if not isinstance(kind, Automatic | Dynamics | WholeSuite):
             raise InputError(f"an envelope needs one of the certificates auto and dynamics, got {kind.name!r}.")
+        if kind.share < 1:
+            raise InputError("an envelope tells which tasks stay below the threshold; leave the share out.")
         self._interval, self._recorder = interval, interval.recorder
         self._threshold, self._confidence = interval.limit, interval.options.confidence
         self._split: tuple[tuple[int, ...], LearnedDynamics | None] | None = None

@@ -34,9 +34,11 @@ from ctxval.certificates.posterior import DistanceBound
 from ctxval.certificates.prediction_tests import DRAWN, HYPERCUBE, MANY, TESTS, hypercube_in
 from ctxval.certificates.predictions import missing_tests, mostly_fail
 from ctxval.certificates.sample import SAME
+from ctxval.certificates.task_share import PREDICTED_ABOVE, bet_on
 from ctxval.certificates.verdict import counterexample, require_suite
 from ctxval.core.trial import Trial, Trials
 from ctxval.errors import CertificateError, InputError
+from ctxval.learning.share_search import ShareSearch
 from ctxval.learning.worst_case import is_kinked
 
 
@@ -45,6 +47,7 @@ class SearchSettings:
     """How tests are chosen, and of what a choice warns."""
 
     hypercubes: int = 128  #: from which the one that is executed is chosen
+    above: float = 10.0  #: expected number of random tasks above the threshold, of which one is executed, at the share
     far: float = 10.0  #: multiple of what is known or allowed from which a predicted distance is said to be dangerous
 
 
@@ -71,7 +74,9 @@ class IntervalSearch:
         if self.threshold is None and isinstance(self.options.kind, AnytimeAudit):
             raise InputError("an anytime audit ends by its threshold; state one, or run another certificate.")
         self.options.kind.require_usable(self.options.confidence, self.budget)
-        self.recorder.dynamics.use_quantile(self.options.kind.quantile)
+        self.recorder.dynamics.ask_of(self.options.kind.quantile, self.options.kind.share)
+        if self._suite is not None and self._share < 1:
+            raise InputError("tasks of a suite are executed one by one, so no share of them is asked for.")
 
     @property
     def limit(self) -> float:
@@ -79,6 +84,8 @@ class IntervalSearch:
         if self.threshold is not None:
             return self.threshold
         learned = self.recorder.dynamics.learned(self.recorder.trials) if self.predicts else None
+        if self._share < 1:
+            return (1 + self.within) * (0.0 if learned is None else learned.worst_of_mean.highest)
         return (1 + self.within) * max(self.best, 0.0 if learned is None else learned.negligible)
 
     @property
@@ -102,8 +109,13 @@ class IntervalSearch:
 
     @property
     def interval(self) -> tuple[float, float | None]:
-        """The largest executed distance, and the bound that a few posterior samples give; None if they give none."""
+        """The largest executed distance, and the bound that a few posterior samples give; None if they give none.
+
+        If a share of the tasks is asked for, its distance on the posterior mean takes the place of the former.
+        """
         evidence = self._evidence()
+        if evidence is not None and self._share < 1:
+            return evidence.highest, evidence.bound
         return self.best, None if evidence is None else evidence.bound
 
     @property
@@ -111,7 +123,8 @@ class IntervalSearch:
         """Whether the executed distances falsify the limit; of a noisy system, one above it may not suffice."""
         kind, confidence = self.options.kind, self.options.confidence
         known = Quantities(space=self.recorder.validation.space)
-        return counterexample(self.recorder.trials, self.limit, known, confidence, kind.quantile) is not None
+        trials = self.recorder.trials
+        return counterexample(trials, self.limit, known, confidence, kind.quantile, kind.share) is not None
 
     def choose(self) -> Choice | None:
         """Return the next task; None if the interval decides, or no task of a suite is left."""
@@ -121,7 +134,7 @@ class IntervalSearch:
         if self.recorder.predicts:  # what only reads a store chooses as the stored speed allows
             self.recorder.dynamics.thinking.measure(trials)
         if self.threshold is not None and any(trial.least > self.threshold for trial in trials):
-            repeated = self._against_noise()
+            repeated = self._against_noise() if self._share == 1 else None
             if repeated is not None or self.is_falsified:
                 return repeated
         if isinstance(self.options.kind, AnytimeAudit):
@@ -131,15 +144,28 @@ class IntervalSearch:
             predictions = self.recorder.dynamics.checked(trials)
             if predictions and predictions[-1].held(self.best) and missing_tests(predictions, self.tests):
                 return self.test()
+        if self._repeats_suffice():
+            return None
         evidence = self._evidence()
         return self._by_distance() if evidence is None or self._fails(evidence) else self._by_dynamics(evidence)
+
+    def _repeats_suffice(self) -> bool:
+        """Return whether the tasks of a suite were executed so often that a quantile of each keeps the limit."""
+        space, trials = self.recorder.validation.space, self.recorder.trials.ended
+        if space.members is None or space.repeats == 1 or not trials:
+            return False
+        sample = replace(Sample.of(trials), suite=space.members, repeats=space.repeats)
+        with suppress(CertificateError):
+            whole = WholeSuite(self.options.kind.quantile).certify(sample, self.options.confidence)
+            return whole.covers(self.limit)
+        return False
 
     def test(self) -> Choice:
         """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""
         trials = self.recorder.trials
         # A hypercube that was begun is completed, because what a part of it shows must not decide that it is left.
         number, row = divmod(spread_tests(trials), TESTS)
-        if self.tests >= MANY and self._suite is None and not row:
+        if (self.tests >= MANY or self._share < 1) and self._suite is None and not row:
             return Choice.tested(self.recorder.draw(), "iid")
         if self._suite is not None:
             return Choice.tested(self.recorder.draws.hypercube(number)[row], "spread")
@@ -198,13 +224,15 @@ class IntervalSearch:
         ended = self.recorder.trials.ended
         if any(trial.origin == "iid" for trial in ended):
             certificate = kind.certify(replace(Sample.of(ended), threshold=self.limit), self.options.confidence)
-            if certificate.covers(self.limit, self.options.volume):
+            if certificate.covers(self.limit, self.options.left_out):
                 return None
         return Choice(self.recorder.draw(), "iid", planned_draws=0)
 
     def _by_distance(self) -> Choice | None:
         """Return the task that the posterior bound of the distance needs; None if it decides."""
         kind = self.options.kind
+        if self._share < 1 and self.recorder.trials:  # it bounds the largest distance alone
+            return self.test()
         # No distance is known, all are 0, or each task of a suite is executed.
         if not isinstance(kind, Automatic | DistanceBound) or not self.limit > 0 or self._suite is not None:
             return Choice(planned_draws=0)
@@ -234,15 +262,17 @@ class IntervalSearch:
             evidence = self._asked(whole)
             with suppress(CertificateError):
                 sample = replace(Sample.of(trials.ended), threshold=self.limit)
-                if certify_dynamics(sample, evidence).covers(self.limit):
+                if certify_dynamics(sample, evidence).covers(self.limit, self.options.left_out):
                     return None
         remedy = self._first_remedy(evidence)
         if remedy.kind == "again":
             return Choice.tested(remedy.tasks[0][0])
+        if remedy.kind == "drawn above" and (above := self._above(self.limit)) is not None:
+            return above
         # For `auto`, the posterior bound of the distance is tried after many executions, besides tests, that decided
         # nothing, and earlier if they cover the tasks, as they soon do in few dimensions.
         lacks_tests = remedy.kind == "drawn"
-        if isinstance(kind, Automatic) and evidence.quantile is None and self._suite is None:
+        if isinstance(kind, Automatic) and evidence.quantile is None and self._suite is None and self._share == 1:
             chosen = sum(trial.origin not in DRAWN for trial in trials)
             in_places = any(opened.code in ("unvisited_region", "untested_rest") for opened in open_checks(evidence))
             if chosen >= 16 and not lacks_tests and not in_places:
@@ -257,8 +287,23 @@ class IntervalSearch:
 
     def _first_remedy(self, evidence: Evidence) -> Remedy:
         """Return what the first open check needs that an execution can close; tasks of a suite are executed once."""
-        usable = (each for each in remedies(evidence, len(self._known)) if each.kind == "drawn" or len(each.tasks))
+        usable = (each for each in remedies(evidence, len(self._known)) if "drawn" in each.kind or len(each.tasks))
         return next((each for each in usable if self._suite is None or each.kind != "again"), Remedy())
+
+    def _above(self, threshold: float) -> Choice | None:
+        """Return one of new random tasks whose predicted distance exceeds a threshold, for a bet; None without one."""
+        recorder, trials = self.recorder, self.recorder.trials
+        learned = recorder.dynamics.learned(trials)
+        if learned is None or not isinstance(learned.search, ShareSearch):
+            return None
+        tasks = recorder.draws.many(trials, round(SEARCH.above / (1 - self._share)))
+        rows = np.flatnonzero(learned.expected(tasks) > threshold)
+        if not len(rows):
+            return None
+        # The first of the tasks, which are in no order.
+        stake = bet_on(learned.search.share_above(learned.drawn_from, threshold), self._share)
+        note = {PREDICTED_ABOVE: [float(threshold), len(rows) / len(tasks), stake]}
+        return replace(Choice.tested(tasks[rows[0]]), note=note)
 
     def _by_evidence(self, evidence: Evidence) -> Choice:
         """Return the first new task that the open checks need."""
@@ -317,6 +362,11 @@ class IntervalSearch:
         bound = evidence.upper
         tolerated = max(min(bound, self.limit), self.limit - bound)  # as far as the margin to the limit allows
         return mostly_fail([prediction.held(tolerated) for prediction in evidence.predictions])
+
+    @property
+    def _share(self) -> float:
+        """The share of the tasks that is asked for; 1 for the largest distance."""
+        return self.options.kind.share
 
     @property
     def _suite(self) -> Array | None:

@@ -220,6 +220,11 @@ class IndependentDraws:
         space = self._validation.space
         return space.rounded(space.unit_draws(1, self._generator(len(trials), _DRAW))[0])
 
+    def many(self, trials: Sequence[Trial], count: int) -> Array:
+        """Return independent draws from which the next task is chosen, points of the unit cube ``(count, d)``."""
+        space = self._validation.space
+        return space.rounded(space.unit_draws(count, self._generator(len(trials), _DRAW, count)))
+
     def hypercube(self, number: int, candidate: int = 0) -> Array:
         """Return one of the Latin hypercubes for tests of a number ``(TESTS, d)``, whatever the results are."""
         rng = self._generator(number, _HYPERCUBE, *([candidate] if candidate else []))

@@ -87,8 +87,10 @@ class TrialRecorder:
         return trial
 
     def plan(self, trial: Trial) -> Plan:
-        """Return the plan of a trial, as :meth:`ctxval.Validation.plan` makes it."""
-        return self.validation.plan(self.validation.space.point(trial.parameters))
+        """Return the plan of a trial, whose task knows how often it was executed before."""
+        plan, before = self.validation.plan(self.validation.space.point(trial.parameters)), self._trials[: trial.number]
+        earlier = sum(bool((other.unit_point == trial.unit_point).all()) for other in before)
+        return replace(plan, task=plan.task.again(earlier)) if earlier else plan
 
     def draw(self) -> Array:
         """Return the next independent draw of a task, a point of the unit cube ``(d,)``."""

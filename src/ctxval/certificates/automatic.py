@@ -7,20 +7,23 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+import scipy
 
 from ctxval._util.checked import NonNegativeInt, PositiveFloat, Probability
 from ctxval._util.registry import part
 from ctxval._util.representation import counted
 from ctxval.certificates.base import Certificate, CertificateKind
+from ctxval.certificates.bounds import percent
 from ctxval.certificates.covering import RESOLUTION, covering, farthest_task
 from ctxval.certificates.dynamics import Dynamics
 from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.posterior import DistanceBound
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
 from ctxval.certificates.predictions import mostly_fail
-from ctxval.certificates.sample import Sample
-from ctxval.certificates.sentences.statements import EXECUTED_AGAIN
+from ctxval.certificates.sample import SAME, Sample
+from ctxval.certificates.sentences.statements import EXECUTED_AGAIN, INDEPENDENT_REPEATS
 from ctxval.certificates.sentences.verdicts import supported as supported_by
+from ctxval.certificates.task_share import Share
 from ctxval.core.quantiles import QUANTILE
 from ctxval.errors import CertificateError
 
@@ -28,10 +31,15 @@ from ctxval.errors import CertificateError
 @part("suite")
 @dataclass(frozen=True, repr=False)
 class WholeSuite(CertificateKind):
-    """The largest distance of a suite of tasks, all of which were executed."""
+    """The largest distance of a suite of tasks, all of which were executed.
+
+    If tasks are repeated, it is a bound on a quantile of the executions of each task, without any law of the noise.
+    """
 
     name: ClassVar[str] = "suite"
     takes_suites: ClassVar[bool] = True
+
+    quantile: Probability = QUANTILE  #: the share of the executions of each task that a bound with repeats is about
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the certificate; the largest executed distance is the largest of all."""
@@ -43,10 +51,37 @@ class WholeSuite(CertificateKind):
                 f"{missing} of {counted(sample.tasks or 0, 'task')} of the suite have no distance yet, so the largest "
                 "one is not known; `ctxval run` executes them."
             )
+        if sample.repeats > 1:
+            return self._of_repeats(sample, confidence)
         h, assumptions = sample.best, (EXECUTED_AGAIN, *sample.remarks)
         statement = f"All {sample.tasks} tasks of the suite were executed, and their largest distance is {h:.6g}."
         details = {"best": h, "tasks": sample.tasks, "failures": sample.failures}
         return Certificate(self.name, statement, h, confidence, 0.0, len(sample), assumptions, details)
+
+    def _of_repeats(self, sample: Sample, confidence: float) -> Certificate:
+        """Return the bound by order statistics: how many of n executions lie below a quantile is binomial."""
+        assert sample.suite is not None
+        doubtful, known = (1 - confidence) / len(sample.suite), np.isfinite(sample.distances)
+        same = np.abs(sample.points[known][:, None] - sample.suite).max(axis=-1) <= SAME
+        repeats = [np.sort(sample.distances[known][of_task]) for of_task in same.T]
+        fewest, q = min(map(len, repeats)), self.quantile
+        needed = int(np.ceil(np.log(doubtful) / np.log(q)))
+        shown = {"quantile": q, "repeats": fewest, "repeats_needed": needed, "share_shown": doubtful ** (1 / fewest)}
+        if fewest < needed:
+            raise CertificateError(
+                f"{counted(fewest, 'execution')} of each task can show, with {percent(confidence)} confidence, that "
+                f"{100 * shown['share_shown']:.3g} % of all its executions stay below a threshold; {needed} are needed "
+                f"for {100 * q:g} % (at most {sample.repeats} are allowed: repeats of the suite)."
+            )
+        ranks = [int((scipy.special.bdtr(np.arange(len(each)), len(each), q) < 1 - doubtful).sum()) for each in repeats]
+        upper = float(max(each[rank] for each, rank in zip(repeats, ranks, strict=True)))
+        statement = (
+            f"In each of {counted(len(repeats), 'task')} of the suite, at least {100 * q:g} % of all executions stay "
+            f"at or below {upper:.6g}, by at least {fewest} executions of each."
+        )
+        details = {"best": sample.best, "tasks": sample.tasks, "failures": sample.failures, **shown}
+        assumptions = (INDEPENDENT_REPEATS, *sample.remarks)
+        return Certificate(self.name, statement, upper, confidence, 0.0, len(sample), assumptions, details)
 
 
 @part("auto")
@@ -67,6 +102,7 @@ class Automatic(CertificateKind):
     resolution: PositiveFloat = RESOLUTION  #: as for the posterior bound
     tests: NonNegativeInt = TESTS  #: executions at drawn tasks; those for learned dynamics must be predicted beforehand
     quantile: Probability = QUANTILE  #: the share of the executions of each task that a bound with noise is about
+    share: Share = 1.0  #: the share of the tasks that the bound is about; 1 for the largest distance
 
     def needs_evidence(self, sample: Sample) -> bool:
         """Return whether the dynamics bound is tried: a resolution of one's own asks for the posterior bound."""
@@ -82,8 +118,10 @@ class Automatic(CertificateKind):
         """
         threshold = sample.threshold
         uses_dynamics = sample.learned is not None and self.needs_evidence(sample)
+        if self.share < 1:  # no other kind bounds the distances of a share of the tasks
+            return Dynamics(tests=self.tests, quantile=self.quantile, share=self.share).certify(sample, confidence)
         if sample.suite is not None and not uses_dynamics:
-            return WholeSuite().certify(sample, confidence)
+            return WholeSuite(self.quantile).certify(sample, confidence)
         by_dynamics = None
         if uses_dynamics:
             with suppress(CertificateError):
@@ -91,7 +129,7 @@ class Automatic(CertificateKind):
                 if by_dynamics.details["quantile"] is not None or _decides(by_dynamics, threshold):
                     return by_dynamics  # the posterior bound of the distance is about systems without noise
         if sample.suite is not None:
-            return by_dynamics or WholeSuite().certify(sample, confidence)
+            return by_dynamics or WholeSuite(self.quantile).certify(sample, confidence)
         preferred = False
         if by_dynamics is not None:
             preferred = _decides(by_dynamics, None) or bool(threshold and supported_by(by_dynamics, threshold))

@@ -118,6 +118,9 @@ class CertificateKind(ShortRepr, ABC):
     quantile = QUANTILE
     """The share of the executions of each task that a threshold is about, if they differ by noise."""
 
+    share = 1.0
+    """The share of the tasks that a threshold is about; 1 for all of them, whose largest distance is d*."""
+
     @classmethod
     def options(cls) -> tuple[str, ...]:
         """Return the names of its options: its fields, and ``volume`` if it validates but for a share of the tasks."""

@@ -39,16 +39,19 @@ class Bets:
         return self.above > 0 and self.wealth >= 1 / (1 - confidence)
 
 
-def bets_against(trials: Sequence[Trial], threshold: float, quantile: float = QUANTILE) -> Bets | None:
+def bets_against(
+    trials: Sequence[Trial], threshold: float, quantile: float = QUANTILE, *, noisy: bool = False
+) -> Bets | None:
     """Return the bets of trials against a threshold; None if the system is not noisy.
 
     It is not if no execution was predicted to be, or if the last one was not, and an excess repeated to the last digit.
+    It is in any case if it is said to be ``noisy``.
     """
     known = [trial for trial in trials if trial.distance is not None or trial.ended_alone is not None]
     noises = [prediction.get("noise") for trial in trials if (prediction := _prediction(trial))]
-    if not any(noises):
+    if not any(noises) and not noisy:
         return None
-    if not noises[-1]:
+    if not noisy and not noises[-1]:
         excesses = (executions_of(trial, known) for trial in known if (trial.distance or 0.0) > threshold)
         if any(len(alike) > 1 and len({each.distance for each in alike}) == 1 for alike in excesses):
             return None

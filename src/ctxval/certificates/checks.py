@@ -48,8 +48,9 @@ class Remedy:
     """Executions that close a check."""
 
     tasks: tuple[Array, ...] = ()  #: tasks ``(m, d)`` in the order of preference, each the first that is new
-    #: whether the first new task is executed, the first one again, or a task that is drawn
-    kind: Literal["new", "again", "drawn"] = "new"
+    #: whether the first new task is executed, the first one again, or a task that is drawn, from all or from those
+    #: whose predicted distances exceed the threshold
+    kind: Literal["new", "again", "drawn", "drawn above"] = "new"
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,6 +308,8 @@ def _farthest(evidence: Evidence) -> Array:
 
 def _at_the_bound(evidence: Evidence, known: int) -> Remedy:
     """Return a task whose distance may exceed the threshold, or every third time one that leads beyond the records."""
+    if evidence.share < 1 and evidence.highest > (evidence.threshold or np.inf):
+        return Remedy(kind="drawn above")  # such draws prove what share of the tasks exceeds it
     exceeds = evidence.threshold is not None and evidence.upper > evidence.threshold
     # Friction is known where records are dense.
     if exceeds and known % 3 == 2 and (not evidence.friction or is_open(evidence, "coverage")):

@@ -21,6 +21,7 @@ import numpy as np
 
 from ctxval._util.checked import NonNegativeInt, Probability
 from ctxval._util.registry import part
+from ctxval.certificates.anytime import anytime_volume
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.bounds import rank_within
 from ctxval.certificates.checks import fewest_missing, withdrawals
@@ -33,6 +34,7 @@ from ctxval.certificates.predictions import latest_tests
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed, require_learned
 from ctxval.certificates.sentences import statements
 from ctxval.certificates.sentences.withdrawals import AUDIT
+from ctxval.certificates.task_share import Share
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError
@@ -56,6 +58,7 @@ class Dynamics(CertificateKind):
 
     tests: NonNegativeInt = TESTS  #: number of executions that must have been predicted beforehand at drawn tasks
     quantile: Probability = QUANTILE  #: the share of the executions of each task that a bound with noise is about
+    share: Share = 1.0  #: the share of the tasks that the bound is about; 1 for the largest distance
 
     def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
         """Refuse a confidence that needs too many draws of the dynamics."""
@@ -75,6 +78,9 @@ class Dynamics(CertificateKind):
                 f"audit.{advice_to_remeasure(sample)}"
             )
         evidence = learned.evidence
+        if self.share < 1 and (sample.suite is not None or (evidence is not None and evidence.quantile is not None)):
+            what = "tasks of a suite are executed one by one" if sample.suite is not None else "the system is noisy"
+            raise CertificateError(f"no share of the tasks is bounded, because {what}; leave the share out.")
         if not (sample.best > 0 or (evidence is not None and evidence.negligible)):
             raise CertificateError(
                 "all distances are 0, so no prediction of a distance was tested. Check that the distance compares what "
@@ -133,11 +139,7 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
     if doubt is None and opened:
         doubt, withdrawn_by = str(opened[0]), opened[0].code
     empty = None if sample.suite is not None else largest_empty_box(sample.points)
-    statement = statements.dynamics_statement(
-        upper, error, confidence, evidence.quantile, parametric=evidence.is_parametric
-    )
-    if evidence.negligible:
-        statement = f"If {statements.SMALL_ERRORS}, d* is at most {upper:.6g}."
+    statement = statements.dynamics_statement(upper, error, confidence, evidence)
     level = upper if sample.threshold is None else sample.threshold
     above = sum(each.distance > level for each in evidence.executed)
     copied = {name: getattr(evidence, name) for name in _COPIED}
@@ -149,6 +151,7 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
         "raised_by_trial": None if worst is None else worst.trial,
         "error": error,
         "executions": evidence.executions,
+        **({} if evidence.share == 1 else {"share": evidence.share, "of_mean": evidence.highest}),
         "draws": len(evidence.maxima),
         **({"thinking": {"replaced": list(evidence.replaced)}} if evidence.replaced else {}),
         "largest_draw": float(finite.max()) if len(finite) == len(evidence.maxima) else None,
@@ -165,6 +168,7 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
                 drawn, sample.points.shape[1], confidence, uniform=sample.is_uniform, selected=sample.selected
             ),
             "largest_error": max((test.error for test in tests), default=None),
+            **({} if evidence.share == 1 else _tests_alone(sample, level, confidence)),
         },
         "checked": [{**each.to_json(), "held": bool(evidence.holds(each))} for each in evidence.predictions],
         "open_checks": [each.to_json() for each in opened],
@@ -192,4 +196,11 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
         doubt=doubt,
         withdrawn_by=None if doubt is None else withdrawn_by,
         error=error,
+        volume=1 - evidence.share,
     )
+
+
+def _tests_alone(sample: Sample, level: float, confidence: float) -> dict[str, float | int]:
+    """Return which share of the tasks exceeds a level at most, by all independent draws, and how many of these do."""
+    above = ~(sample.only("iid").distances <= level)
+    return {"share_missed": anytime_volume(above, 1 - confidence), "above": int(above.sum())}

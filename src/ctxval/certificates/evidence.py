@@ -72,6 +72,8 @@ class Evidence(ShortRepr):
     scatter: float = 0.0
     #: the largest distance under errors of M as small as all that were recorded; 0 if such errors are learned
     negligible: float = 0.0
+    #: the share of the tasks whose largest distance the maxima are; with less than 1, they are quantiles over the tasks
+    share: float = 1.0
     replaced: tuple[str, ...] = ()  #: stages that were left out, or replaced by cheaper ones, for lack of time
     # The question
     best: float = 0.0  #: the largest executed distance
@@ -114,8 +116,8 @@ class Evidence(ShortRepr):
         """The order statistic of the maxima, raised by what searches and predictions have missed."""
         last = self.predictions[-self.limits.predictions :]
         upper = self.upper * self.search_shortfall
-        # A noisy execution may exceed the quantile that is bounded.
-        upper = max(upper, self.best) if self.quantile is None else upper
+        # A noisy execution may exceed the quantile that is bounded, and so may some tasks that of a share.
+        upper = max(upper, self.best) if self.quantile is None and self.share == 1 else upper
         return upper + 0.5 * max((prediction.excess for prediction in last), default=0.0)
 
     @cached_property

@@ -33,13 +33,18 @@ class CertificateOptions(ShortRepr):
     confidence: Confidence = CONFIDENCE  #: confidence level of the certificate, at least 0.5
     volume: Volume = 0.0  #: share of the tasks that may exceed the threshold; if it is 0, only bounds on d* validate
 
+    @property
+    def left_out(self) -> float:
+        """The share of the tasks that may exceed the threshold, by the volume or by the share of its kind."""
+        return max(self.volume, 1 - self.kind.share)
+
     @classmethod
     def or_automatic(
-        cls, certificate: CertificateOptions | None, confidence: float, resolution: float
+        cls, certificate: CertificateOptions | None, confidence: float, resolution: float, share: float = 1.0
     ) -> CertificateOptions:
         """Return a certificate that is given, beside which no options may stand; else ``auto`` with the options."""
         if certificate is None:
-            return cls(Automatic(resolution), confidence)
-        if (confidence, resolution) != (CONFIDENCE, RESOLUTION):
-            raise InputError("confidence and resolution are options of certificate=; state them there.")
+            return cls(Automatic(resolution, share=share), confidence)
+        if (confidence, resolution, share) != (CONFIDENCE, RESOLUTION, 1.0):
+            raise InputError("confidence, resolution and share are options of certificate=; state them there.")
         return certificate

@@ -48,6 +48,7 @@ class Sample(ShortRepr):
     learned: Learned | None = None  #: what the experiment's model predicts; None if it is not loaded
     distribution: str | None = None  #: the distribution of tasks as a text; None if it is uniform
     suite: Array | None = None  #: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box
+    repeats: int = 1  #: how often each task of the suite may be executed, because executions of one task differ
     threshold: float | None = None  #: the threshold that is to be decided; None if there is none
     selected: float = 1.0  #: the share of all hypercubes that those of the tests were chosen from
 

@@ -9,13 +9,14 @@ from typing import Any, Literal
 from ctxval._util.checked import PositiveFloat, checked, require
 from ctxval._util.representation import ShortRepr, call, line, lines, shown
 from ctxval.certificates.base import KINDS, Certificate, CertificateKind
-from ctxval.certificates.bets import bets_against
+from ctxval.certificates.bets import Bets, bets_against
 from ctxval.certificates.bounds import NO_UNITS, Quantities
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.options import CONFIDENCE, CertificateOptions, Confidence, Volume
 from ctxval.certificates.provenance import Provenance
 from ctxval.certificates.sample import Sample, without_success
 from ctxval.certificates.sentences import verdicts as sentences
+from ctxval.certificates.task_share import bets_on_share
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Trial, designs_sentence
 from ctxval.errors import CertificateError
@@ -73,15 +74,18 @@ def counterexample(
     quantities: Quantities = NO_UNITS,
     confidence: float = CONFIDENCE,
     quantile: float = QUANTILE,
+    share: float = 1.0,
 ) -> Verdict | None:
     """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it.
 
     The distance of the steps before a failure counts, but less than that of whole executions. With noise, a single one
-    does not suffice (:mod:`ctxval.certificates.bets`), except in a suite, executed once.
+    does not suffice (:mod:`ctxval.certificates.bets`), except in a suite without repeats. Nor does it falsify that a
+    ``share`` of the tasks stays below the threshold (:mod:`ctxval.certificates.task_share`).
     """
-    once = quantities.space is not None and quantities.space.members is not None
-    tau, bets = float(threshold), None if once else bets_against(trials, float(threshold), quantile)
-    if bets is not None and not bets.falsify(confidence):
+    tau = float(threshold)
+    bets = _bets(trials, tau, quantile, quantities) if share == 1 else None
+    of_share = bets_on_share(trials, tau, share, confidence) if share < 1 else None
+    if not all(each is None or each.falsify(confidence) for each in (bets, of_share)):
         return None
     failed = without_success(trials)
     above = [
@@ -92,6 +96,9 @@ def counterexample(
     if not above:
         return None
     worst = max(above, key=lambda trial: (trial.distance is not None, trial.least))
+    if of_share is not None:
+        why = sentences.share_falsified(worst, tau, quantities, of_share, share, confidence)
+        return Verdict("falsified", tau, why, worst)
     return Verdict("falsified", tau, sentences.falsified(worst, trials, tau, quantities, bets, confidence), worst)
 
 
@@ -114,7 +121,8 @@ def judge_by(
     by_name = KINDS.find(certificate.kind) if certificate.kind in KINDS else CertificateKind
     quantities = known.quantities
     quantile = certificate.details.get("quantile") or (kind or by_name).quantile
-    falsified = counterexample(trials, tau, quantities, certificate.confidence, quantile)
+    share = certificate.details.get("share", 1.0) if kind is None else kind.share
+    falsified = counterexample(trials, tau, quantities, certificate.confidence, quantile, share)
     if falsified is not None:
         return replace(falsified, certificate=certificate)
     if not certificate.covers(tau, volume):
@@ -143,18 +151,21 @@ def judge(
     All trials of the campaign are given. If the theory of the certificate refuses them, the verdict is undecided.
     """
     known, chosen = provenance or Provenance(), options or CertificateOptions()
-    quantile = chosen.kind.quantile
-    verdict = counterexample(trials, threshold, known.quantities, chosen.confidence, quantile)
+    quantile, share = chosen.kind.quantile, chosen.kind.share
+    if share < 1:  # the largest distance of another store falsifies no share of the tasks
+        known = replace(known, beside=tuple(replace(each, worst=None) for each in known.beside))
+    verdict = counterexample(trials, threshold, known.quantities, chosen.confidence, quantile, share)
     if verdict is None:
         try:
             certificate = _certified(trials, chosen, known, threshold)
-            verdict = judge_by(certificate, trials, threshold, volume=chosen.volume, provenance=known, kind=chosen.kind)
+            left_out, kind = chosen.left_out, chosen.kind
+            verdict = judge_by(certificate, trials, threshold, volume=left_out, provenance=known, kind=kind)
         except CertificateError as error:
             verdict = Verdict("undecided", float(threshold), str(error))
     designs, remarks = designs_sentence(trials), list(verdict.remarks)
     parts = [verdict.reason.removesuffix("."), verdict.expected, designs]
     remarks += [] if designs is None else [designs]
-    bets = bets_against(trials, float(threshold), quantile)
+    bets = _bets(trials, float(threshold), quantile, known.quantities) if share == 1 else None
     if verdict.answer != "falsified" and bets is not None and bets.above:
         above = sentences.noise_may_explain(bets, float(threshold), known.quantities, chosen.confidence)
         parts.insert(0 if verdict.answer == "undecided" else len(parts), above)
@@ -164,13 +175,21 @@ def judge(
     return replace(verdict, reason=f"{reason}.{caution}", remarks=tuple(remarks))
 
 
+def _bets(trials: Sequence[Trial], threshold: float, quantile: float, quantities: Quantities) -> Bets | None:
+    """Return the bets against a threshold; None if one execution above it suffices."""
+    space = quantities.space
+    if space is None or space.members is None:
+        return bets_against(trials, threshold, quantile)
+    return bets_against(trials, threshold, quantile, noisy=True) if space.repeats > 1 else None
+
+
 def _certified(
     trials: Sequence[Trial], options: CertificateOptions, known: Provenance, threshold: float | None
 ) -> Certificate:
     """Return a certificate, for a threshold if there is one. Most kinds see countable draws only."""
-    suite = None if known.space is None else known.space.members
+    suite, repeats = (None, 1) if known.space is None else (known.space.members, known.space.repeats)
     sample, kind = Sample.of(trials, known.learned), options.kind
-    sample = replace(sample, distribution=known.distribution, suite=suite, threshold=threshold)
+    sample = replace(sample, distribution=known.distribution, suite=suite, repeats=repeats, threshold=threshold)
     if suite is not None:
         require_suite(kind)
     # No statement may count draws whose number depended on their distances.
@@ -223,7 +242,7 @@ def assess(
     known, kind = provenance or Provenance(), options.kind
     falsified = None
     if threshold is not None:
-        falsified = counterexample(trials, threshold, known.quantities, options.confidence, kind.quantile)
+        falsified = counterexample(trials, threshold, known.quantities, options.confidence, kind.quantile, kind.share)
         if falsified is None:
             verdict = judge(trials, threshold, options, known)
             if verdict.certificate is None:

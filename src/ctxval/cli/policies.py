@@ -22,6 +22,7 @@ from ctxval.core.task import Task
 from ctxval.distances import CommandError
 from ctxval.errors import CtxvalError, InputError
 from ctxval.models import MuJoCo as Model
+from ctxval.models.mujoco import proposed_invariant
 from ctxval.systems import MuJoCo
 
 SECONDS = 3.0  # duration of the tasks that a drafted experiment has
@@ -76,13 +77,14 @@ def _experiment(file: Path, contract: PolicyContract, made: RobotPolicy, policy:
         distance = {"type": "FinalState", "components": [0]}
     else:
         distance = {"type": "MaximumDeviation", "components": list(range(len(contract.joints) or 1))}
+    invariant = list(proposed_invariant(compiled))
     simulator = tomlkit.inline_table()
     simulator.update({"type": "MuJoCo", "mjcf": robot, "dt": dt})
     parts = {
         "space": {name: list(given) for name, given in space.items()},
         "task": task,
         "system": {"type": "Imperfect", "step": simulator, "delay": 1.0, **before},
-        "model": {"type": "MuJoCo", "mjcf": robot, "dt": dt},
+        "model": {"type": "MuJoCo", "mjcf": robot, "dt": dt, **({"invariant": invariant} if invariant else {})},
         "synthesizer": {"type": "RobotPolicy", "contract": named, "mjcf": robot},
         "distance": distance,
         **_names(compiled),

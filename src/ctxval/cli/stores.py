@@ -59,6 +59,7 @@ class Asked:
     resolution: float | None = None
     tests: int | None = None
     quantile: float | None = None
+    share: float | None = None
     option: list[str] | None = None
 
     def options(self, settings: ExperimentSettings, kind: str | None) -> CertificateOptions:

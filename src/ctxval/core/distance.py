@@ -37,7 +37,7 @@ class ComposedDistance(Protocol):
 
 
 class NamedStates(ShortRepr):
-    """A dataclass whose options ``components``, ``angles`` and ``state`` may have names of states besides indices."""
+    """A dataclass with options ``components``, ``angles``, ``quaternions``, ``state``: indices or names of states."""
 
     def with_states(self, names: Sequence[str]) -> Self:
         """Return the same with the indices of states in place of their names, if there are names."""
@@ -48,7 +48,7 @@ class NamedStates(ShortRepr):
             return names.index(value) if isinstance(value, str) else value
 
         indices: dict[str, Any] = {}
-        for option in ("components", "angles", "state") if names else ():
+        for option in ("components", "angles", "quaternions", "state") if names else ():
             value: Any = getattr(self, option, None)
             if isinstance(value, str):
                 indices[option] = index(value)

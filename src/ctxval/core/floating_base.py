@@ -10,6 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.checked import NonNegativeInt, PositiveFloat, checked
+from ctxval._util.quaternions import normalised
 from ctxval._util.representation import ShortRepr
 from ctxval.core.distance import Distance
 from ctxval.core.task import Task
@@ -44,8 +45,7 @@ class FloatingBase(ShortRepr):
 
     def quaternion(self, x: Array) -> Array:
         """Return the unit quaternions ``(..., 4)`` of the base, w first."""
-        q = self._of_free(x)[..., self.position + 3 : self.position + 7]
-        return np.asarray(q / np.maximum(np.linalg.norm(q, axis=-1, keepdims=True), 1e-12))
+        return normalised(self._of_free(x)[..., self.position + 3 : self.position + 7])
 
     def gravity(self, x: Array) -> Array:
         """Return the unit vector ``(..., 3)`` of gravity in the body frame."""
@@ -156,6 +156,11 @@ class UntilFall(ShortRepr):
         """Return the same with the indices of states in place of their names."""
         named = getattr(self.distance, "with_states", None)
         return replace(self, distance=named(names)) if callable(named) else self
+
+    def with_quaternions(self, quaternions: Sequence[int]) -> UntilFall:
+        """Return the same with the quaternions of a model; see :class:`ctxval.distances.StateNorm`."""
+        turning = getattr(self.distance, "with_quaternions", None)
+        return replace(self, distance=turning(quaternions)) if callable(turning) else self
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this distance in a store."""

@@ -86,6 +86,7 @@ class TaskSpace:
     """
 
     members: Array | None = None
+    repeats: int = 1  # how often a campaign executes each member at most
     """The tasks as points of the unit cube ``(N, d)``, if they are finitely many; None if they fill the box."""
 
     def __init__(self, **bounds: tuple[Any, ...]) -> None:
@@ -229,7 +230,7 @@ class TaskSpace:
         return dict(zip(self.labels, point.tolist(), strict=True))
 
     def remaining(self, known: Array) -> Array | None:
-        """Return the members that are not among points ``(n, d)`` of the unit cube; None if tasks fill the box."""
+        """Return the members that may follow executions at points ``(n, d)``; None if tasks fill the box."""
         return None
 
     def task_names_at(self, points: Array) -> Any:

@@ -85,6 +85,8 @@ class Task:
         """Shape ``(..., H + 1, n)``; all zero if the task has neither goal nor reference."""
         self.has_goal: bool = goal is not None or reference is not None
         """Whether a goal or a reference was given."""
+        self.repetition = 0
+        """How often its campaign executed the same task before; of a batch 0."""
         self.name: Any = name
         """The name of the task, or those of a batch, ``(...)``; empty if it has none."""
         self.environment: dict[str, Array] = {
@@ -136,6 +138,12 @@ class Task:
     def named(self, name: Any) -> Task:
         """Return the task with a name, or a batch with an array of names."""
         return self._like(self.initial_state, self.reference, name, self.environment)
+
+    def again(self, repetition: int) -> Task:
+        """Return the task as it is executed after so many executions of it."""
+        task = self._like(self.initial_state, self.reference, self.name, self.environment)
+        task.repetition = repetition
+        return task
 
     def _like(self, initial_state: Array, reference: Array, name: Any, environment: Mapping[str, Array]) -> Task:
         name = name if np.ndim(name) else str(name)

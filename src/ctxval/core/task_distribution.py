@@ -41,7 +41,7 @@ class Normal(ShortRepr):
     """The normal distribution of a task parameter, with a mean and a deviation, numbers or one for each component.
 
     They are in the parameter's units, and hold before the task space truncates the distribution to the parameter's
-    bounds.
+    bounds. Values ``(...)`` of a number, or ``(..., k)`` of a vector, give probabilities of their shape.
     """
 
     mean: ArrayLike

@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Rows, as_finite, as_floats, require_shape
+from ctxval._util.checked import PositiveInt, require
 from ctxval._util.representation import call
 from ctxval._util.texts import enumerated, shortened
 from ctxval.core.space import Parameters, Point, TaskSpace
@@ -36,6 +37,8 @@ class TaskSuite(TaskSpace):
         tasks: the parameters of each task by its name, with the same parameters for all tasks; or names alone, which
             are then the category ``task``.
         units: the units of parameters by name.
+        repeats: how often a campaign executes each task at most, because executions of one task differ. All tasks are
+            executed once before one is repeated.
 
     >>> suite = TaskSuite({"slow lift": {"speed": 0.2, "path": "lift"}, "fast turn": {"speed": 1.0, "path": "turn"}})
     >>> suite.task_names
@@ -43,8 +46,12 @@ class TaskSuite(TaskSpace):
     """
 
     def __init__(
-        self, tasks: Mapping[str, Mapping[str, float | str]] | Sequence[str], units: Mapping[str, str] | None = None
+        self,
+        tasks: Mapping[str, Mapping[str, float | str]] | Sequence[str],
+        units: Mapping[str, str] | None = None,
+        repeats: PositiveInt = 1,
     ) -> None:
+        self.repeats = require("repeats", PositiveInt, repeats)
         self._tasks = _by_name(tasks)
         self.task_names: tuple[str, ...] = tuple(self._tasks)
         names, units = list(next(iter(self._tasks.values()))), units or {}
@@ -91,17 +98,20 @@ class TaskSuite(TaskSpace):
         return len(self.task_names)
 
     def __repr__(self) -> str:
-        return call(self, shortened(enumerated(self.task_names, 4), 120), parameters=self.names, tasks=len(self))
+        names = shortened(enumerated(self.task_names, 4), 120)
+        repeats = self.repeats if self.repeats > 1 else None
+        return call(self, names, parameters=self.names, tasks=len(self), repeats=repeats)
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this suite in a store: the parameters of each task by its name, and units."""
+        """Return what identifies this suite in a store: the parameters of each task by its name, units and repeats."""
         units = {name: unit for name, unit in self.units.items() if unit}
-        return {SUITE: {name: dict(values) for name, values in self._tasks.items()}, "_units": units}
+        repeats = {"_repeats": self.repeats} if self.repeats > 1 else {}
+        return {SUITE: {name: dict(values) for name, values in self._tasks.items()}, "_units": units, **repeats}
 
     @classmethod
     def described(cls, description: Mapping[str, Any]) -> TaskSuite:
         """Return the suite of a description."""
-        return cls(description[SUITE], description.get("_units"))
+        return cls(description[SUITE], description.get("_units"), description.get("_repeats", 1))
 
     # Members
 
@@ -115,9 +125,13 @@ class TaskSuite(TaskSpace):
         """Return the name of the member at one point ``(d,)`` of the unit cube."""
         return self.task_names[int(self.rows_at(unit))]
 
+    def executions(self, known: Array) -> Rows:
+        """Return how many of points ``(n, d)`` of the unit cube are executions of each member, ``(N,)``."""
+        return np.bincount(self.rows_at(known) if len(known) else [], minlength=len(self))
+
     def remaining(self, known: Array) -> Array:
-        gone = set(self.rows_at(known).tolist()) if len(known) else set[int]()
-        return self.members[[row for row in range(len(self)) if row not in gone]]
+        executions = self.executions(known)
+        return np.asarray(self.members[executions == min(executions.min(), self.repeats - 1)])
 
     # Between points, the unit cube and names
 

@@ -22,6 +22,7 @@ from ctxval._util.columns import (
     unit_advice,
 )
 from ctxval._util.files import MOST_BYTES, Archive, read_bytes, written_whole
+from ctxval._util.quaternions import interpolated
 from ctxval._util.representation import ShortRepr, Shown, call, counted, number
 from ctxval._util.tables import CsvTable
 from ctxval._util.texts import enumerated, guarded, parted, visible
@@ -281,7 +282,8 @@ class Trajectory:
     def resampled(self, times: Array) -> Trajectory:
         """Return one recorded trajectory at other times ``(H + 1,)``, in seconds after its first time, from 0.
 
-        States are interpolated linearly. Inputs, which hold until the next sample, are averaged over the steps.
+        States are interpolated linearly, unit quaternions on the sphere. Inputs, which hold until the next sample, are
+        averaged over the steps.
         A record that is there twice counts once.
         """
         if self.batch_shape:
@@ -309,7 +311,7 @@ class Trajectory:
         if not recorded[-1] >= wanted[-1] - _TIMES * dt:
             ends = f"the recording ends after {recorded[-1]:g} s, and {wanted[-1]:g} s are needed"
             raise InputError(f"{ends}{advice}.")
-        states = np.stack([np.interp(wanted, recorded, column) for column in self.states.T], axis=-1)
+        states = interpolated(wanted, recorded, self.states)
         # A sample that belongs to a time may have been recorded just after it.
         inputs = held_means(recorded[:-1], self.inputs, wanted, 1e-6 * dt)
         return Trajectory(wanted, states, inputs, self.ended)
@@ -328,15 +330,15 @@ _JITTER = 0.25  # largest difference between measured times and those of a task,
 def at_times(trajectory: Trajectory, times: Array) -> Trajectory:
     """Return a trajectory at the times of a task ``(H + 1,)``, counted from its first time, from its measured times.
 
-    States are interpolated linearly. The inputs stay, because each was applied when its state was measured. An
-    InputError refuses times that are further away than a quarter of a step.
+    States are interpolated linearly, unit quaternions on the sphere. The inputs stay, because each was applied when its
+    state was measured. An InputError refuses times that are further away than a quarter of a step.
     """
     recorded, dt = trajectory.times - trajectory.times[0], np.diff(times)[:1]
     misses = np.abs(recorded - times) if len(recorded) == len(times) else np.array([np.inf])
     if (misses <= _TIMES * dt).all() or not (misses <= _JITTER * dt).all():
         require_times(trajectory, times)
         return trajectory
-    states = np.stack([np.interp(times, recorded, column) for column in trajectory.states.T], axis=-1)
+    states = interpolated(times, recorded, trajectory.states)
     return Trajectory(times, states, trajectory.inputs, trajectory.ended)
 
 

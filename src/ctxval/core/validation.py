@@ -28,6 +28,7 @@ from ctxval.core.model import Model, Step, as_model, require_time_step
 from ctxval.core.plan import Outcome, Plan, ended_early, recorded_until_end, require_complete, require_execution
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
+from ctxval.core.state_geometry import geometry_of
 from ctxval.core.system import OutputsLike, Simulated, System, WithOutputs, as_outputs
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
@@ -95,6 +96,9 @@ class Validation:
         named = getattr(distance, "with_states", None)
         if callable(named):
             distance = named(tuple(parted(label)[0] for label in states))
+        turning = getattr(distance, "with_quaternions", None)
+        if callable(turning) and outputs is None:
+            distance = turning(geometry_of(self.model).quaternions)
         self.distance: Distance = until_fall(distance, synthesizer)
         self.start_tolerance = float(start_tolerance)
         self.longest = int(longest)
@@ -204,6 +208,10 @@ class Validation:
         tolerance = self.start_tolerance if start_tolerance is None else start_tolerance
         if not isinstance(trajectory, Trajectory):
             raise ExecutionError(f"the system returned {type(trajectory).__name__} instead of a Trajectory")
+        if (wanted := plan.task.initial_state).shape == trajectory.states.shape[-1:] and self.outputs is None:
+            geometry = geometry_of(self.model)
+            if geometry.quaternions and trajectory.states.ndim == 2:
+                trajectory = replace(trajectory, states=geometry.continued(trajectory.states, wanted))
         if ended_early(plan, trajectory) and (plan.model_trajectory.ended != COMPLETE or self.falls(trajectory)):
             return recorded_until_end(plan, trajectory, tolerance)
         require_complete(plan, trajectory)
@@ -232,7 +240,7 @@ class Validation:
         return self._measured(plan.parameters.points, value)
 
     def remeasure(self, point: ArrayLike, model_trajectory: Trajectory, system_trajectory: Trajectory) -> float:
-        """Return d(p) between two known trajectories, as :meth:`measure` does, without the design of a controller."""
+        """Return d(p) at ``(d,)`` between known trajectories, as :meth:`measure` does; no controller is designed."""
         parameters = self.space.parameters(point)
         value = self.distance_between(model_trajectory, system_trajectory, self.task_at(parameters))
         return self._measured(parameters.points, value)

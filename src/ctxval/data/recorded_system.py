@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,8 +51,9 @@ class Recorded:
     If only their inputs are known, it is the task function (:meth:`task`) and the synthesizer of a validation, too.
 
     Args:
-        runs: the recordings by the names of their tasks, or a folder with one log for each task, whose name is that of
-            the file without its ending.
+        runs: the recordings by the names of their tasks, one or several in the order in which a campaign gets them; or
+            a folder with one log for each task, whose name is that of the file without its ending, or with a folder of
+            this name for several.
         mapping: which fields of the logs are states and inputs, and how long a step is; a TOML file, a table as in
             one, or :class:`ctxval.data.LogMapping`. Without inputs, they are those that the controller gives along
             the records.
@@ -62,32 +63,40 @@ class Recorded:
 
     def __init__(
         self,
-        runs: Mapping[str, Trajectory] | str | Path,
+        runs: Mapping[str, Trajectory | Sequence[Trajectory]] | str | Path,
         mapping: LogMapping | dict[str, Any] | str | Path | None = None,
         stopped_by: str = "",
     ) -> None:
         self.stopped_by = stopped_by
+        self.runs: dict[str, tuple[Trajectory, ...]] = {}
         if isinstance(runs, Mapping):
-            self.runs = dict(runs)
+            for name, given in runs.items():
+                self.runs[name] = (given,) if isinstance(given, Trajectory) else tuple(given)
         else:
             chosen = LogMapping.from_table(mapping) if isinstance(mapping, dict) else mapping
             chosen = LogMapping.from_toml(chosen) if isinstance(chosen, str | Path) else chosen
-            self.runs = {}
-            for path in logs_in(Path(runs)):
+            folders = sorted(each for each in Path(runs).iterdir() if each.is_dir()) if Path(runs).is_dir() else []
+            for path in [log for each in folders or [Path(runs)] for log in logs_in(each)]:
                 whole = read_recordings([path], chosen).runs
                 if len(whole) != 1:
                     raise InputError(f"{path} must have one recording without gaps, and has {len(whole)}.")
                 name = path.stem if path.suffix.lower() != ".gz" else Path(path.stem).stem
-                self.runs[name] = whole[0].trajectory
-        if not self.runs:
-            raise InputError("there is no recording.")
+                name = path.parent.name if folders else name
+                self.runs[name] = (*self.runs.get(name, ()), whole[0].trajectory)
+        if not self.runs or not all(self.runs.values()):
+            raise InputError("there is no recording, or none of a task.")
 
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(self.runs)
 
+    @property
+    def repeats(self) -> int:
+        """The number of recordings that each task has at least, for the repeats of a suite."""
+        return min(map(len, self.runs.values()))
+
     def task(self, p: Parameters) -> Task:
-        """Return the task that a recording is of: from its first state, for all its steps."""
+        """Return the task that the first recording is of: from its first state, for all its steps."""
         run = self._run(str(p.task))
         return Task(run.states[0], horizon=run.horizon, dt=float(run.times[1] - run.times[0]))
 
@@ -95,15 +104,18 @@ class Recorded:
         """Return the recorded inputs of a task, in an open loop, for controllers of which nothing else is known."""
         return RecordedInputs(self._run(task.name).inputs)
 
-    def _run(self, name: str) -> Trajectory:
+    def _run(self, name: str, repetition: int = 0) -> Trajectory:
         if name not in self.runs:
             known = enumerated(self.runs, 6)
             raise ExecutionError(f"there is no recording of the task {name!r}; there are those of {known}")
-        return self.runs[name]
+        runs = self.runs[name]
+        if repetition >= len(runs) > 1:
+            raise ExecutionError(f"the task {name!r} has {len(runs)} recordings, and all of them were executed")
+        return runs[min(repetition, len(runs) - 1)]
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Return the recording of a task; raise an ExecutionError if there is none."""
-        run, steps = self._run(task.name), task.horizon
+        """Return the recording of a task that is next in turn; raise an ExecutionError if there is none."""
+        run, steps = self._run(task.name, task.repetition), task.horizon
         ended = run.ended if run.horizon <= steps else COMPLETE
         if run.horizon < steps and self.stopped_by:
             ended = f"{TERMINATED}: {self.stopped_by}"
@@ -125,4 +137,4 @@ class Recorded:
         return recorded
 
     def __repr__(self) -> str:
-        return call(self, tasks=len(self.runs))
+        return call(self, tasks=len(self.runs), repeats=self.repeats if self.repeats > 1 else None)

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from ctxval._util.arrays import Array, held_means
+from ctxval._util.quaternions import continued, normalised, quaternions_in
 from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError
@@ -207,6 +208,7 @@ def _part(
         raise InputError(f"{source} has {steps:.3g} steps of {dt:g} s, more than 20000000: give a larger dt.")
     times: Array = np.asarray(dt * np.arange(int(steps) + 1), dtype=np.float64)
     states, inputs = list[Array](), list[Array]()
+    channels, turning = _with_one_sign(channels)
     for channel in channels:
         if channel.of_input:  # it holds until the next sample, which may come within a step
             good = np.isfinite(channel.values)
@@ -215,7 +217,23 @@ def _part(
         else:
             states.append(_interpolated(channel, start + times))
     columns = np.stack(inputs, axis=-1) if inputs else np.empty((int(steps), 0))
-    return start, Trajectory(times, np.stack(states, axis=-1), columns)
+    together = np.stack(states, axis=-1)
+    for at in turning:
+        together[:, at] = normalised(together[:, at])
+    return start, Trajectory(times, together, columns)
+
+
+def _with_one_sign(channels: Sequence[Channel]) -> tuple[list[Channel], list[slice]]:
+    """Return channels, the states first, whose quaternions keep one sign, and the places of these in states."""
+    states, inputs = ([each for each in channels if each.of_input == of_input] for of_input in (False, True))
+    recorded, turning = [each.values[np.isfinite(each.values)] for each in states], list[slice]()
+    for at in quaternions_in(recorded):
+        times = [each.recorded for each in states[at]]
+        if all(np.array_equal(times[0], other) for other in times):
+            turning.append(at)
+            columns = zip(states[at], continued(np.stack(recorded[at], axis=-1)).T, strict=True)
+            states[at] = [replace(each, times=times[0], values=column) for each, column in columns]
+    return states + inputs, turning
 
 
 def _interpolated(channel: Channel, times: Array) -> Array:

@@ -6,7 +6,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from ctxval._util.arrays import Array, ArrayLike, as_finite
 from ctxval._util.checked import FiniteFloat, Norm, PositiveInt
 from ctxval._util.registry import part
 from ctxval.core.distance import NamedStates, require_indices, selected
+from ctxval.core.state_geometry import StateGeometry
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError, ShapeError
@@ -37,6 +38,9 @@ class StateNorm(NamedStates):
     #: the states that are angles in radians, by index or name; the difference is taken on the circle, so it is at most
     #: pi
     angles: Sequence[int | str] = ()
+    #: the states that are the first number, w, of a unit quaternion, by index or name. Its difference is a rotation
+    #: vector in radians in the places of x, y and z, and 0 in that of w. Those of a MuJoCo model are found.
+    quaternions: Sequence[int | str] = ()
 
     def __post_init__(self) -> None:
         if self.components is not None and not len(self.components):
@@ -52,8 +56,8 @@ class StateNorm(NamedStates):
         return None if (factors == 1).all() else factors
 
     def difference(self, states: Array, others: Array) -> Array:
-        """Return the weighted differences ``states - others`` of the compared states; the leading axes broadcast."""
-        gap = selected(self.unwrapped(states - others), self.components)
+        """Return the weighted differences of the compared ones of states ``(..., n)``; leading axes broadcast."""
+        gap = selected(self.gap(states, others), self.components)
         counts = [len(given) for given in (self.weights, self.scales) if given is not None]
         if set(counts) - {gap.shape[-1]}:
             raise ShapeError(f"there must be a weight or a scale for each of {gap.shape[-1]} states, got {counts[0]}.")
@@ -64,14 +68,27 @@ class StateNorm(NamedStates):
         """Return the norms of the weighted differences of states ``(..., n)``, shape ``(...)``."""
         return np.asarray(np.linalg.norm(self.difference(states, others), self.norm, axis=-1))
 
-    def unwrapped(self, gap: Array) -> Array:
-        """Return differences of states ``(..., n)``; those of angles are moved to at most pi in magnitude."""
+    def gap(self, states: Array, others: Array) -> Array:
+        """Return the differences of all states ``(..., n)``; those of angles are at most pi in magnitude."""
+        gap = self._geometry(states.shape[-1]).difference(states, others)
         if not len(self.angles):
             return gap
         moved = np.array(gap)
         angles = require_indices("angles", self.angles, gap.shape[-1])
         moved[..., angles] = turned(gap[..., angles])
         return moved
+
+    def _geometry(self, states: int) -> StateGeometry:
+        places = require_indices("quaternions", self.quaternions, states - 3) if len(self.quaternions) else []
+        return StateGeometry(tuple(places))
+
+    def with_quaternions(self, quaternions: Sequence[int]) -> Self:
+        """Return the same with the quaternions of a model, if it names none and compares all of their numbers."""
+        if len(self.quaternions) or not quaternions:
+            return self
+        compared = None if self.components is None else {*self.components}
+        whole = tuple(w for w in quaternions if compared is None or {w, w + 1, w + 2, w + 3} <= compared)
+        return dataclasses.replace(self, quaternions=whole)
 
     def added_units(self, units: Sequence[str]) -> tuple[str, ...]:
         """Return the units of the states that the norm adds; none if it has weights or scales."""
@@ -82,11 +99,14 @@ class StateNorm(NamedStates):
         return tuple(dict.fromkeys(units[i] for i in places if units[i]))
 
     def describe(self) -> dict[str, Any]:
-        names = [field.name for field in dataclasses.fields(self)]
-        described = {name: getattr(self, name) for name in names if name not in ("weights", "scales", "angles")}
+        names, unusual = (
+            [field.name for field in dataclasses.fields(self)],
+            ("weights", "scales", "angles", "quaternions"),
+        )
+        described = {name: getattr(self, name) for name in names if name not in unusual}
         if (factors := self.factors) is not None:
             described["factors"] = factors
-        return described | ({"angles": self.angles} if self.angles else {})
+        return described | {name: given for name in unusual[2:] if len(given := getattr(self, name))}
 
 
 @dataclass(frozen=True)
@@ -142,7 +162,7 @@ class AtTimes(ErrorNorm):
     """Largest norm of the difference between the states at stated times, such as those of a grasp or a hand-over.
 
     Attributes:
-        norm, components, weights, scales, angles: as in :class:`StateNorm`.
+        norm, components, weights, scales, angles, quaternions: as in :class:`StateNorm`.
         times: seconds after the start of the task; each is rounded to the nearest step.
     """
 
@@ -209,7 +229,7 @@ class RelativeDeviation(StateNorm):
     is away from M by a tenth of the model's own motion.
 
     Attributes:
-        norm, components, weights, scales, angles: as in :class:`StateNorm`.
+        norm, components, weights, scales, angles, quaternions: as in :class:`StateNorm`.
         least: smallest range that a gap is divided by, for each compared state in its unit; a state at rest would
             otherwise have an unbounded relative error.
     """
@@ -228,8 +248,12 @@ class RelativeDeviation(StateNorm):
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         gap = self.difference(system_trajectory.states, model_trajectory.states)
-        moved = selected(np.ptp(model_trajectory.states, axis=-2), self.components)
-        ranges = np.maximum(moved, np.asarray(self.least, dtype=np.float64))
+        states = model_trajectory.states
+        moved = np.ptp(states, axis=-2)
+        if len(self.quaternions):
+            moved = np.ptp(self.gap(states, states[..., :1, :]), axis=-2)
+            moved[..., self._geometry(states.shape[-1]).quaternions] = 1.0  # the gap of w is 0
+        ranges = np.maximum(selected(moved, self.components), np.asarray(self.least, dtype=np.float64))
         return np.asarray(np.linalg.norm(gap / ranges[..., None, :], self.norm, axis=-1).max(axis=-1))
 
 
@@ -242,7 +266,7 @@ class WholeTrajectory(StateNorm):
     printed for the Dubins car, ``1/H ||xi_S - xi_M||_2``.
 
     Attributes:
-        norm, components, weights, scales, angles: as in :class:`StateNorm`.
+        norm, components, weights, scales, angles, quaternions: as in :class:`StateNorm`.
         per_step: whether the norm is divided by the horizon H.
     """
 
@@ -281,7 +305,7 @@ class TrackingError(StateNorm):
     It is the combined measure of Remark 1 for tasks with a reference: :class:`GoalError` is that for tasks with a goal.
 
     Attributes:
-        norm, components, weights, scales, angles: as in :class:`StateNorm`.
+        norm, components, weights, scales, angles, quaternions: as in :class:`StateNorm`.
         over: ``maximum`` or ``mean``: how the norms at the times are combined.
     """
 
@@ -307,7 +331,8 @@ class AtCrossing(ErrorNorm):
     does not cross so often is compared at its final state.
 
     Attributes:
-        norm, components, weights, scales, angles: as in :class:`StateNorm`. An angle crosses the level on the circle.
+        norm, components, weights, scales, angles, quaternions: as in :class:`StateNorm`. An angle crosses the level on
+            the circle.
         state: index or name of the state that crosses the level.
         level: the level, in the unit of this state.
         direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
@@ -337,7 +362,8 @@ class AtCrossing(ErrorNorm):
         before = np.minimum(places.astype(np.intp), trajectory.horizon - 1)[..., None]
         first = np.take_along_axis(states, before, axis=-2)
         second = np.take_along_axis(states, before + 1, axis=-2)
-        return np.asarray(first + (places[..., None] - before) * self.unwrapped(second - first))
+        part = (places[..., None] - before) * self.gap(second, first)
+        return self._geometry(n).add(first, part)
 
 
 @part()

@@ -137,10 +137,11 @@ class DynamicsDraws(DrawsWithoutNoise):
             if isinstance(self.model, DryFriction):
                 following = self.model.following(x, acting, lambda inputs: self.residuals(x, inputs))
             elif memory is None:
-                following = self.model.step(x, acting) + self.residuals(x, acting)
+                following = self.data.geometry.corrected(self.model.step(x, acting), self.residuals(x, acting), x)
             else:
                 following, given = advanced(self.model, x, acting, self._of_draws(memory))
-                following, memory = following + self.residuals(x, acting), given.reshape(memory.shape)
+                following = self.data.geometry.corrected(following, self.residuals(x, acting), x)
+                memory = given.reshape(memory.shape)
             return following.reshape(shape), memory
 
     def residuals(self, x: Array, u: Array) -> Array:
@@ -187,7 +188,8 @@ class DisturbedDynamics(DrawsWithoutNoise):
 
     def _moved(self, x: Array, x_next: Array) -> Array:
         together = self._of_draws(x)
-        return np.asarray((x_next.reshape(together.shape) + self.added(self.ways, together)).reshape(x.shape))
+        added = self.added(self.ways, together)
+        return self.mean.data.geometry.corrected(x_next.reshape(together.shape), added, together).reshape(x.shape)
 
 
 def bounded(z: Array) -> Array:

@@ -22,6 +22,7 @@ import scipy
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows
 from ctxval.core.model import Model
+from ctxval.core.state_geometry import geometry_of
 from ctxval.core.trajectory import Transitions
 from ctxval.models.increments import standard_deviations
 
@@ -96,7 +97,8 @@ class DryFriction:
             force = self._force(x, u, reached + residuals, effects, force)
             residuals = missed(u - force)
         force = self._force(x, u, reached + residuals, effects, force)
-        return np.asarray(reached + residuals - (effects * force[..., None, :]).sum(axis=-1))
+        following = geometry_of(self.model).corrected(reached, residuals, x)
+        return np.asarray(following - (effects * force[..., None, :]).sum(axis=-1))
 
     def _force(self, x: Array, u: Array, reached: Array, effects: Array, force: Array) -> Array:
         """Return the friction ``(..., m)`` that holds joints, but for their creep, if it can, from a first guess."""

@@ -20,6 +20,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
+from ctxval.core.state_geometry import PLAIN, StateGeometry
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 from ctxval.gp.cholesky import factorise, pivoted_rows
@@ -33,7 +34,7 @@ from ctxval.learning.hyperparameters import (
     learning_rows,
 )
 from ctxval.learning.kernel_expansion import Component, KernelExpansion, draw_functions, joined
-from ctxval.learning.residual_data import ResidualData, residual_data, smoother_than
+from ctxval.learning.residual_data import ResidualData, residual_data, smoother_than, with_what_varies
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ class PosteriorSettings:
     least_variance: float = 0.1  # share of the noise below which a transition's variance given the chosen adds nothing
     pivots: int = 100  # largest number of pairs at which a draw is exact
     families: tuple[tuple[float, float], ...] = FAMILIES  # smoothness and growth of each family of covariances
+    varies: float = 0.3  # log evidence per recorded value from which residuals depend on states that M says invariant
     of_steps: bool = True  # whether the system may be learned without M, if M is rougher than the system
 
     @classmethod
@@ -65,6 +67,7 @@ class LearnedCovariances(ShortRepr):
     posterior: HyperparameterPosterior
     settings: PosteriorSettings
     seed: tuple[int, ...]
+    geometry: StateGeometry = PLAIN  # of the states, as residuals depend on them
 
     @functools.cached_property
     def drawn(self) -> list[ResidualHyperparameters]:
@@ -313,6 +316,7 @@ def learn_covariances(
     if data is None:
         return None
     with single_threaded():
+        data = with_what_varies(data, model, transitions, sources, settings.learned_from, settings.varies)
         if settings.of_steps and not isinstance(model, DryFriction):
             with contextlib.suppress(InputError, np.linalg.LinAlgError):  # numbers too large for a linear model
                 smoother = smoother_than(data, settings.learned_from)
@@ -323,12 +327,12 @@ def learn_covariances(
         Z, Y = data.pairs, data.outputs[:, data.learned]
         rows = learning_rows(Z, data.inputs, settings.learned_from)
         posterior = HyperparameterPosterior.given(Z[rows], Y[rows], data.inputs, settings.families)
-    return LearnedCovariances(model, smoother is not None, data.scale, posterior, settings, seed)
+    return LearnedCovariances(model, smoother is not None, data.scale, posterior, settings, seed, data.geometry)
 
 
 def condition(covariances: LearnedCovariances, transitions: Transitions, sources: Rows) -> DynamicsPosterior | None:
     """Return the posterior given transitions and learned covariances; None if nothing usable is left to learn."""
-    data = residual_data(covariances.model, transitions, sources)
+    data = residual_data(covariances.model, transitions, sources, geometry=covariances.geometry)
     return None if data is None else DynamicsPosterior(covariances, data)
 
 

@@ -32,6 +32,7 @@ from ctxval.learning.precision import AgreeingDynamics, AgreementSettings, agree
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, scheduled
 from ctxval.learning.regular import RegularSettings, split_transitions
+from ctxval.learning.share_search import ShareSearch
 from ctxval.learning.stage_costs import Costs, Ledger, ThinkingSettings, reduced
 from ctxval.learning.structure import StructureSearch, StructureSettings, most_telling
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
@@ -62,6 +63,7 @@ class DynamicsStudy(ShortRepr):
         validation: the same with the states of M if only outputs are recorded, and with the physical task parameters
             as further states; everything is learned of these.
         quantile: the share of the executions of a task that a distance is about, if the system is noisy.
+        share: the share of the tasks whose distances are asked for; 1 for the largest one.
         effects: effects of inputs, with their sizes; empty if commands act as they are.
         friction: M with the dry friction that it lacks, of which the residual is learned; None without.
         with_data: whether the data that M was made from are learned from.
@@ -79,8 +81,9 @@ class DynamicsStudy(ShortRepr):
         effects: Found = (),
         friction: DryFriction | None = None,
         with_data: bool = True,
+        share: float = 1.0,
     ) -> None:
-        self.settings = settings or LearningSettings()
+        self.settings, self.share = settings or LearningSettings(), share
         self.given, self.seed, self.quantile = validation, seed, quantile
         self.effects, self.friction, self.with_data = effects, friction, with_data
         of_inputs = InputEffects(tuple(each.effect for each in effects))
@@ -95,10 +98,11 @@ class DynamicsStudy(ShortRepr):
         #: largest distances of tasks if M errs by so much in each step, of each error and task
         self.under_errors: dict[bytes, dict[bytes, float]] = {}
 
-    def fresh_copy(self, quantile: float | None = None) -> DynamicsStudy:
-        """Return a study of the same experiment that has learned nothing yet, with a quantile if it is given."""
+    def fresh_copy(self, quantile: float | None = None, share: float | None = None) -> DynamicsStudy:
+        """Return a study of the same experiment that has learned nothing yet, with what is given."""
         quantile = self.quantile if quantile is None else quantile
-        return DynamicsStudy(self.given, self.seed, quantile, settings=self.settings)
+        share = self.share if share is None else share
+        return DynamicsStudy(self.given, self.seed, quantile, settings=self.settings, share=share)
 
     def made(
         self,
@@ -120,7 +124,7 @@ class DynamicsStudy(ShortRepr):
             extended = same if effects is None else None
             self._made[key] = DynamicsStudy(
                 given, self.seed, self.quantile, extended, self.settings,
-                effects=kept, friction=friction, with_data=with_data,
+                effects=kept, friction=friction, with_data=with_data, share=self.share,
             )  # fmt: skip
         return self._made[key]
 
@@ -142,11 +146,13 @@ class DynamicsStudy(ShortRepr):
     def search(self) -> WorstCaseSearch:
         """Searches the tasks for the largest distance of each draw."""
         settings = WorstCaseSettings.for_dimension(self.validation.space.dimension, self.planner.batched)
+        if self.share < 1:
+            return ShareSearch(self.planner, self.seed, self.share, settings)
         return WorstCaseSearch(self.planner, self.seed, settings)
 
     def search_within(self, ledger: Ledger, replicates: int) -> WorstCaseSearch:
         """Return the search, of fewer tasks if the budget of a ledger does not allow all of them."""
-        if not ledger.is_limited:
+        if not ledger.is_limited or self.share < 1:  # fewer tasks tell nothing of a share of them
             return self.search
         shares = self.settings.thinking.shares if self.search.members is None else (1.0,)
         for share in shares:

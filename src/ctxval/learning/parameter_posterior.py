@@ -20,6 +20,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model, advanced, with_memory
+from ctxval.core.state_geometry import PLAIN, StateGeometry, geometry_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.uncertain import UncertainModel
 from ctxval.learning.effects.effect import EffectCandidate
@@ -62,6 +63,7 @@ class Segments:
     reached: Array  # recorded states after each step, (N, L, n)
     scale: Array  # of the errors of each state, (n,)
     missed: Array  # mean squared errors of M, (N,)
+    geometry: StateGeometry = PLAIN
 
     @classmethod
     def of(
@@ -79,14 +81,14 @@ class Segments:
         if len(parts) > settings.segments:
             parts = [parts[k] for k in np.sort(rng.permutation(len(parts))[: settings.segments])]
         states, memory, execution, begins, reached = (np.array(each) for each in zip(*parts, strict=True))
-        units = np.ones(states.shape[1]), np.ones(len(states))
+        units = np.ones(states.shape[1]), np.ones(len(states)), geometry_of(model)
         segments = cls(states, memory, np.stack(commands), execution, begins, reached, *units)
         errors = segments.errors(model)[0]
         finite = np.isfinite(errors).all(axis=(1, 2))
         if not finite.any():
             return None
         sizes = np.sqrt((errors[finite] ** 2).mean(axis=(0, 1)))
-        changes = np.sqrt(((reached[:, 0] - states) ** 2).mean(axis=0))
+        changes = np.sqrt((segments.geometry.difference(reached[:, 0], states) ** 2).mean(axis=0))
         # Chatter of numbers in a state that M predicts far better than others is no error that parameters explain.
         relative = np.divide(sizes, changes, out=np.zeros_like(sizes), where=changes > 0)
         scale = np.maximum(sizes, settings.chatter * relative.max(initial=0.0) * changes)
@@ -107,7 +109,7 @@ class Segments:
             for step in range(self.reached.shape[1]):
                 acting = commands[:, self.execution, self.first + step]
                 x, memory = advanced(model, np.array(x), acting, np.array(memory))
-                errors.append((x - self.reached[:, step]) / self.scale)
+                errors.append(self.geometry.difference(x, self.reached[:, step]) / self.scale)
         return np.stack(errors, axis=2)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model, advanced, memory_in, predicted_steps, with_memory
+from ctxval.core.state_geometry import PLAIN, StateGeometry, geometry_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.uncertain import UncertainModel
 from ctxval.learning.draws import DrawsWithoutNoise
@@ -67,10 +68,11 @@ class Rest:
     rests: Array  # recorded, (N, n)
     lengths: tuple[int, ...]  # numbers of steps of the executions
     limit: float
+    geometry: StateGeometry = PLAIN
 
     def features(self, x: Array, u: Array, before: Array) -> Array:
         """Return features ``(..., F)`` of states, inputs and the inputs before."""
-        whole = np.concatenate([x, u, u - before], axis=-1)
+        whole = np.concatenate([self.geometry.features(x), u, u - before], axis=-1)
         bounded = np.clip(np.nan_to_num((whole - self.shift) / self.scale), -self.limit, self.limit)
         return np.concatenate([np.ones((*x.shape[:-1], 1)), bounded], axis=-1)
 
@@ -82,17 +84,18 @@ def rest_of(
     steps = [with_memory(model, trajectory) for trajectory in executed]
     before = np.concatenate([np.concatenate([each.u[:1], each.u[:-1]]) for each in steps])
     source = np.repeat(np.arange(len(steps)), [len(each) for each in steps])
+    geometry = geometry_of(model)
     with np.errstate(all="ignore"):
-        errors = np.concatenate([each.x_next - predicted_steps(model, each) for each in steps])
+        errors = np.concatenate([geometry.missed(each.x_next, predicted_steps(model, each), each.x) for each in steps])
     x, u = (np.concatenate([getattr(each, name) for each in steps]) for name in ("x", "u"))
     if not (finite := np.isfinite(errors).all(axis=1)).any():
         return None
     errors[~finite] = 0.0
-    whole = np.concatenate([x, u, u - before], axis=1)
+    whole = np.concatenate([geometry.features(x), u, u - before], axis=1)
     shift, scale = whole.mean(axis=0), whole.std(axis=0) + 1e-6 * np.abs(whole).max(axis=0) + 1e-9
     count = whole.shape[1] + 1
     empty = np.zeros((count, errors.shape[1]))
-    rest = Rest(shift, scale, empty, np.eye(count), np.zeros(errors.shape[1]), errors, (), settings.limit)
+    rest = Rest(shift, scale, empty, np.eye(count), np.zeros(errors.shape[1]), errors, (), settings.limit, geometry)
     F = rest.features(x, u, before)
     penalty = settings.ridge * np.eye(count)
     penalty[0, 0] = 1e-3
@@ -159,10 +162,11 @@ class ParametricDraws(DrawsWithoutNoise):
         before = np.where(step > 0, before, inputs)
         following, of_model = advanced(self._drawn, each, inputs, of_model)
         if self.weights.any():
-            following = following + self.rest.features(each, inputs, before) @ self.weights
+            missed = self.rest.features(each, inputs, before) @ self.weights
+            following = self.rest.geometry.corrected(following, missed, each)
         if self.rows.shape[1]:
             at = self.rows[np.arange(len(self)), int(step[0, 0, 0]) % self.rows.shape[1]]
-            following = following + self.rest.rests[at][:, None]
+            following = self.rest.geometry.corrected(following, self.rest.rests[at][:, None], each)
         memory = np.concatenate([step + 1, inputs, of_model], axis=-1).reshape(memory.shape)
         return np.asarray(following).reshape(x.shape), memory
 
@@ -327,16 +331,16 @@ def learned_parameters(
 class _Single:
     """One draw as a model of its own."""
 
-    drawn: Model
+    model: Model
 
     def step(self, x: Array, u: Array) -> Array:
-        return np.asarray(self.drawn.step(_one(x), _one(u))).reshape(x.shape)
+        return np.asarray(self.model.step(_one(x), _one(u))).reshape(x.shape)
 
     def start(self, x: Array) -> Array:
-        return memory_in(self.drawn, _one(x)).reshape(*x.shape[:-1], -1)
+        return memory_in(self.model, _one(x)).reshape(*x.shape[:-1], -1)
 
     def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
-        following, after = advanced(self.drawn, _one(x), _one(u), _one(memory))
+        following, after = advanced(self.model, _one(x), _one(u), _one(memory))
         return np.asarray(following).reshape(x.shape), after.reshape(memory.shape)
 
 

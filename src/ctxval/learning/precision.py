@@ -60,7 +60,8 @@ class AgreeingDynamics(LearnedDynamics):
         planner, data, settings = self.study.planner, self.posterior.data, self.study.settings.agreement
         x, u, following = data.transitions.x, data.transitions.u, data.transitions.x_next
         with np.errstate(all="ignore"):
-            recorded = np.abs(following - self.posterior.covariances.model.step(x, u)).max(axis=0)
+            predicted = self.posterior.covariances.model.step(x, u)
+            recorded = np.abs(data.geometry.missed(following, predicted, x)).max(axis=0)
         least = np.maximum(epsilons(following) * np.abs(following).max(axis=0), 1e-300)
         # The next power of 2 stays the same after most executions, so that closed loops need not be run again.
         errors = 2 ** np.ceil(np.log2(np.maximum(recorded, least)))

@@ -118,7 +118,8 @@ def _is_regular(
     learned = data.learned
     with single_threaded(), np.errstate(all="ignore"):
         pairs = data.standardised(transitions.x, transitions.u)
-        residuals = (transitions.x_next - predicted_steps(posterior.covariances.model, transitions))[:, learned]
+        predicted = predicted_steps(posterior.covariances.model, transitions)
+        residuals = data.geometry.missed(transitions.x_next, predicted, transitions.x)[:, learned]
         errors = np.abs(residuals / data.sizes[learned] - most.mean(pairs[None])[0])
         sizes = np.sqrt(most.squares / len(most.centres))
         doubts = np.sqrt(np.maximum(most.whitened(pairs)[1], 0.0))[:, None] * sizes

@@ -7,12 +7,14 @@ itself only few. The data decide: both models explain the same recorded transiti
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.model import Model, predicted_steps
+from ctxval.core.state_geometry import PLAIN, StateGeometry, geometry_of
 from ctxval.core.trajectory import Transitions
 from ctxval.learning.dry_friction import DryFriction
 from ctxval.learning.hyperparameters import FAMILIES, ResidualKernel, climbed, learning_rows
@@ -60,28 +62,36 @@ class ResidualData:
     recorded: Array
     executed: Mask
     executions: Transitions  # those of executions, also of joints that friction holds
+    geometry: StateGeometry = PLAIN  # of the states of M
 
     def standardised(self, x: Array, u: Array) -> Array:
         """Return standardised pairs ``(..., n + m)`` of states and acting inputs."""
-        return standardised_pairs(x, u, self.shift, self.scale)
+        return standardised_pairs(self.geometry.features(x), u, self.shift, self.scale)
 
 
 def residual_data(
-    model: Model, transitions: Transitions, sources: Rows, *, unlearned: bool = False
+    model: Model,
+    transitions: Transitions,
+    sources: Rows,
+    *,
+    unlearned: bool = False,
+    geometry: StateGeometry | None = None,
 ) -> ResidualData | None:
     """Return the residuals of a model; None if fewer than two transitions are usable, or if M explains all of them.
 
-    With ``unlearned``, no state counts as one with a residual that is not negligible.
+    With ``unlearned``, no state counts as one with a residual that is not negligible. The geometry is that of the model
+    by default.
     """
-    recorded, moving = np.concatenate([transitions.x, transitions.u], axis=1), np.ones(len(transitions), dtype=np.bool_)
-    every = transitions
+    geometry = geometry_of(model) if geometry is None else geometry
+    recorded = np.concatenate([geometry.features(transitions.x), transitions.u], axis=1)
+    every, moving = transitions, np.ones(len(transitions), dtype=np.bool_)
     if isinstance(model, DryFriction):
         transitions, moving = model.acting(transitions)
         model = model.model
     with np.errstate(all="ignore"):
-        residuals = transitions.x_next - predicted_steps(model, transitions)
-        steps = transitions.x_next - transitions.x
-    pairs = np.concatenate([transitions.x, transitions.u], axis=1)
+        residuals = geometry.missed(transitions.x_next, predicted_steps(model, transitions), transitions.x)
+        steps = geometry.difference(transitions.x_next, transitions.x)
+    pairs = np.concatenate([geometry.features(transitions.x), transitions.u], axis=1)
     # Larger numbers have diverged, and their squares would not be finite.
     usable = (np.abs(np.concatenate([pairs, residuals, steps], axis=1)) < 1e100).all(axis=1)
     teach = usable & moving
@@ -111,13 +121,14 @@ def residual_data(
         recorded=(recorded[usable] - shift) / scale,
         executed=sources[usable] >= 0,
         executions=every[np.flatnonzero(usable & (sources >= 0))],
+        geometry=geometry,
     )
 
 
 def smoother_than(data: ResidualData, count: int) -> tuple[Model, ResidualData] | None:
     """Return a linear model and its residuals if these are far more probable than M's, by ``count`` transitions."""
     # With at least 10 transitions for each coefficient, the fit itself explains little.
-    if len(data.pairs) < 10 * (data.pairs.shape[1] + 1):
+    if len(data.pairs) < 10 * (data.pairs.shape[1] + 1) or data.geometry != PLAIN:  # no linear model turns
         return None
     known = data.transitions
     predicted = known.x_next - data.outputs * data.units
@@ -132,6 +143,35 @@ def smoother_than(data: ResidualData, count: int) -> tuple[Model, ResidualData] 
         if other is not None and len(other.pairs) == len(data.pairs):
             return (linear, other) if _log_density(other, rows) > needed else None
     return None
+
+
+class InvarianceWarning(UserWarning):
+    """The executions contradict that the dynamics do not depend on some states."""
+
+
+def with_what_varies(
+    data: ResidualData, model: Model, transitions: Transitions, sources: Rows, count: int, better: float
+) -> ResidualData:
+    """Return residuals as functions of all states if ``count`` transitions contradict that some are invariant.
+
+    They do if the log evidence per recorded value is better by so much.
+    """
+    if not data.geometry.invariant:
+        return data
+    every = residual_data(model, transitions, sources, geometry=StateGeometry(data.geometry.quaternions))
+    if every is None or len(every.pairs) != len(data.pairs):
+        return data
+    rows = learning_rows(every.pairs, data.inputs, count)
+    gain = _log_density(every, rows) - _log_density(data, rows)
+    if not gain > better * len(rows) * max(1, int(data.learned.sum())):
+        return data
+    warnings.warn(
+        "what the model misses depends on states that it calls invariant: the ground may not be flat, or a wall is "
+        "near. All states count now; remove `invariant`.",
+        InvarianceWarning,
+        stacklevel=2,
+    )
+    return every
 
 
 class Identity:

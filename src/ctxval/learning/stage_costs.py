@@ -287,7 +287,7 @@ class Costs:
 
     def search(self, settings: WorstCaseSettings, replicates: float = 1.0, *, whole: bool = True) -> float:
         """Return the seconds of a search on the mean, with the pool's plans and the coverage of their loops."""
-        tasks = min(1500, settings.evaluations)
+        tasks = settings.random or min(1500, settings.evaluations)
         loops = self.run(1, settings.pool, replicates) + self.run(1, tasks, min(replicates, 3.0), self._batches(tasks))
         loops += self.run(1, self.sizes.executions)
         beside = self.plan(16 * self.sizes.dimension) if whole else 0.0  # parameters that change no loop
@@ -299,6 +299,7 @@ class Costs:
     def screening(self, settings: WorstCaseSettings, replicates: float = 1.0, rests: bool = False) -> float:
         """Return the seconds of a few draws on some tasks."""
         tasks = settings.local_maxima + settings.shared // 4 + self.sizes.executions
+        tasks = settings.shared if settings.random else tasks
         own = 8 * settings.rounds * (2 * self.sizes.dimension + settings.moves + 1) if rests else 0
         tasks += 256 if rests else 0  # friction at rest differs
         seconds = self.draws(8) + self.plan(tasks + own) + self.run(1, tasks) + self.run(8, tasks, replicates)
@@ -316,6 +317,9 @@ class Costs:
         """Return the seconds of all evidence of a verdict that each campaign needs."""
         s = self.sizes
         groups = 20 if replicates == 1 else 5
+        if settings.random:
+            seconds = self.plan(settings.shared) + self.run(draws, settings.shared, replicates) + self.draws(groups)
+            return seconds + self.run(1, min(256, settings.pool), replicates) + self.run(1, s.executions)
         shared = settings.local_maxima + settings.shared + s.executions
         moves = 2 * s.dimension + settings.moves + 1
         beside = settings.peaks * (settings.nearby + 1)

@@ -37,7 +37,8 @@ def push_response(
     pushes[np.arange(len(states)), 0, :, states] = residuals[:, None] * LEVELS
     pushes[:, 1] = -pushes[:, 0]
     with single_threaded():
-        visited = np.concatenate([loops.states.reshape(-1, n) for loops in planner.run(posterior.mean, planned)])
+        loops = planner.run(posterior.mean, planned)
+        visited = data.geometry.features(np.concatenate([each.states.reshape(-1, n) for each in loops]))
         low, high = np.quantile(visited[np.isfinite(visited).all(axis=1)], [1e-3, 1 - 1e-3], axis=0)
         widths = np.maximum(high - low, 1e-9)
         recorded = scipy.spatial.cKDTree((data.pairs * data.scale + data.shift)[:, :n] / widths)
@@ -67,7 +68,7 @@ def pushed(
     def added(ways: Rows, x: Array) -> Array:
         if recorded is None:
             return np.asarray(pushes[ways, None])
-        scaled = np.clip(np.nan_to_num(x / widths), -1e6, 1e6)
+        scaled = np.clip(np.nan_to_num(mean.data.geometry.features(x) / widths), -1e6, 1e6)
         distance, _ = recorded.query(scaled, p=np.inf, distance_upper_bound=near)
         return np.asarray(pushes[ways, None] * np.isinf(distance)[..., None])
 

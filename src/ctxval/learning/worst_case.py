@@ -49,6 +49,7 @@ class WorstCaseSettings:
     screened_draws: int = 8  # number of draws of the hyperparameters in a screening
     screened_tasks: int = 1500  # number of tasks in its search on the mean
     further: int = 256  # number of random tasks in a screening if draws differ in the dry friction at rest
+    random: int = 0  # number of random tasks from which the distance of a share of them follows; 0 for the largest one
 
     def intensified(self, dimension: int) -> int:
         """Return the number of tasks of each of two intensified searches."""

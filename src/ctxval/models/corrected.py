@@ -11,6 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask, as_finite, rows_of
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model, advanced, linearize, memory_in
+from ctxval.core.state_geometry import geometry_of
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.increments import standardised_pairs
@@ -109,7 +110,7 @@ class Corrected(ShortRepr):
     data: Transitions | None = None  #: the transitions that the correction was learned from, if any
 
     def step(self, x: Array, u: Array) -> Array:
-        return np.asarray(self.model.step(x, u) + self.correction(x, u))
+        return self._corrected(x, u, self.model.step(x, u))
 
     def start(self, x: Array) -> Array:
         """Return the memory of M at the start of closed loops in states ``(..., n)``."""
@@ -118,7 +119,11 @@ class Corrected(ShortRepr):
     def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
         """Return the next states and the memory of M, as :class:`ctxval.core.model.ModelWithMemory`."""
         x_next, memory = advanced(self.model, x, u, memory)
-        return np.asarray(x_next + self.correction(x, u)), memory
+        return self._corrected(x, u, x_next), memory
+
+    def _corrected(self, x: Array, u: Array, x_next: Array) -> Array:
+        geometry = geometry_of(self.model)
+        return geometry.corrected(x_next, self.correction(geometry.features(x), u), x)
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return A ``(..., n, n)`` and B ``(..., n, m)``, without batch axes if they are those of a linear model M."""
@@ -157,7 +162,7 @@ class Refined(ShortRepr):
         return memory_in(self.model, x)
 
     def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
-        """Return the next states and the memory of the model, as :class:`ctxval.core.model.ModelWithMemory`."""
+        """Return the next states ``(..., n)`` and the memory, as :class:`ctxval.core.model.ModelWithMemory`."""
         return advanced(self.model, x, u, memory)
 
 

@@ -7,12 +7,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ctxval._util.arrays import Array
-from ctxval._util.checked import Seconds
+from ctxval._util.checked import Seconds, require_known
 from ctxval._util.mjcf import Simulator, compile_mjcf, is_mjcf_text, quiet
 from ctxval._util.refusals import require_extra
 from ctxval._util.registry import part
 from ctxval.core.model import paired
+from ctxval.core.state_geometry import StateGeometry
 from ctxval.core.trajectory import Transitions
 from ctxval.core.uncertain import UncertainParameter
 from ctxval.errors import InputError
@@ -42,6 +45,9 @@ class MuJoCo:
             ``centre_x`` (``_y``, ``_z``), ``friction``, ``damping``, ``armature``, ``frictionloss``, ``stiffness``,
             ``gain`` and ``gravity_x`` (``_y``, ``_z``), of all elements, or of those that a name or a pattern in
             brackets matches. A share multiplies them, a number in SI units is added.
+        invariant: what the dynamics do not depend on: ``["x", "y", "yaw"]`` of the only free joint, on flat ground
+            without walls, or names of hinges and slides. What M misses is then learned as a function of the other
+            states, in the heading frame, and records need not cover these. If executions contradict, all states count.
     """
 
     uncertain: tuple[UncertainParameter, ...] = ()
@@ -57,6 +63,7 @@ class MuJoCo:
         sites: str | Sequence[str] = (),
         axes: str = "xy",
         uncertain: Mapping[str, float | str] | None = None,
+        invariant: Sequence[str] = (),
     ) -> None:
         _, model = compile_mjcf(mjcf if is_mjcf_text(mjcf) else identified_in(Path(mjcf)))
         timestep = float(model.opt.timestep)
@@ -66,6 +73,7 @@ class MuJoCo:
             raise InputError(f"dt must be a multiple of the model's timestep, {timestep:g} s, got {dt:g} s.")
         self.data, self.sites, self.axes = data, sites, axes
         self._simulate(model)
+        self._geometry = _geometry_of(model, tuple(invariant), bool(self.sites))
         if uncertain:
             self._parameters = uncertain_parameters(model, uncertain)
             self.uncertain = tuple(each.prior for each in self._parameters)
@@ -87,6 +95,11 @@ class MuJoCo:
     def compiled(self) -> Any:
         """The compiled ``mujoco.MjModel``, which must not be changed: :meth:`changed` changes a copy."""
         return self._simulator.model
+
+    @property
+    def geometry(self) -> StateGeometry:
+        """The quaternions of free and of ball joints in the state, and what the dynamics do not depend on."""
+        return self._geometry
 
     def changed(self, change: Callable[[Any], None] | None = None, *, forces: Array | None = None) -> MuJoCo:
         """Return the model after a function has changed its compiled ``mujoco.MjModel``.
@@ -130,6 +143,35 @@ class MuJoCo:
         x, u = paired(x, u)
         with quiet():
             return self._simulator.advance(x, u, memory)[:2]
+
+
+def _geometry_of(compiled: Any, invariant: tuple[str, ...], sites: bool) -> StateGeometry:
+    places, kinds = compiled.jnt_qposadr.tolist(), compiled.jnt_type.tolist()
+    quaternions = tuple(at + 3 * (kind == 0) for at, kind in zip(places, kinds, strict=True) if kind <= 1)
+    if not invariant:
+        return StateGeometry(quaternions)
+    if sites or kinds.count(0) > 1:
+        raise InputError("invariant states need one free joint at most, and no sites, whose places depend on them.")
+    named, heading = {compiled.joint(k).name: at for k, at in enumerate(places) if kinds[k] > 1}, None
+    if 0 in kinds:
+        first = places[kinds.index(0)]
+        named |= {"x": first, "y": first + 1, "yaw": first}
+        heading = first, compiled.nq + int(compiled.jnt_dofadr[kinds.index(0)])
+    require_known("invariant state", invariant, named)
+    if "yaw" in invariant and not {"x", "y"} <= {*invariant}:
+        raise InputError("dynamics that do not depend on yaw do not depend on x and y either: name all three.")
+    of_states = tuple(named[name] for name in invariant if name != "yaw")
+    return StateGeometry(quaternions, of_states, heading if "yaw" in invariant else None)
+
+
+def proposed_invariant(compiled: Any) -> tuple[str, ...]:
+    """Return what the dynamics do not depend on if one robot moves freely above flat ground; empty otherwise."""
+    collides = (compiled.geom_contype | compiled.geom_conaffinity) != 0
+    fixed = np.flatnonzero(collides & (compiled.body_weldid[compiled.geom_bodyid] == 0))
+    planes = (compiled.geom_type[fixed] == 0) & (compiled.geom_bodyid[fixed] == 0)
+    upright = np.abs(compiled.geom_quat[fixed, 1:3]).max(axis=1, initial=0.0) < 1e-9
+    flat = bool((planes & upright).all()) and not compiled.opt.gravity[:2].any()
+    return ("x", "y", "yaw") if flat and compiled.jnt_type.tolist().count(0) == 1 else ()
 
 
 def identified_in(path: Path) -> Path:

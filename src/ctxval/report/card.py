@@ -86,7 +86,7 @@ def card(context: ReportContext, origin: str = "") -> Card:
     """
     verdict, worst = context.verdict, context.worst_first[:1]
     bound = context.bound
-    if context.suite is not None and not len(context.suite.remaining(context.points)):
+    if context.suite is not None and context.suite.executions(context.points).all():
         bound = distance_of(worst[0])  # all tasks were executed
     executed = [trial for trial in context.trials if trial.executed]
     stated = {each.threshold for each in context.store.thresholds() or ()}

@@ -55,7 +55,7 @@ class Axis(ShortRepr):
 
     @classmethod
     def over(cls, label: str, *values: ArrayLike, zero: bool = False, room: float = 0.06) -> Axis:
-        """Return an axis that holds all finite values, with some room around them: a share of the range at each end.
+        """Return an axis that holds all finite values ``(...)``, with room: a share of the range at each end.
 
         With ``zero`` it starts at 0; values are then expected to be at least 0.
         """
@@ -74,7 +74,7 @@ class Axis(ShortRepr):
         return self.low - width, self.low + width
 
     def shares(self, values: ArrayLike) -> Array:
-        """Return how far along the axis values are, from 0 to 1; a little more for those beyond its ends."""
+        """Return how far along the axis values ``(...)`` are, from 0 to 1; a little more for those beyond its ends."""
         low, high = self.ends
         return np.clip((np.asarray(values, dtype=np.float64) - low) / (high - low), -0.02, 1.02)
 
@@ -91,7 +91,7 @@ class Axis(ShortRepr):
 
 @dataclass(eq=False)
 class Chart(ShortRepr):
-    """A chart with two axes, to which lines, bands and marks are added in the order of drawing."""
+    """A chart with two axes, to which lines, bands and marks, arrays ``(N,)``, are added in the order of drawing."""
 
     title: str  #: what it shows; screen readers read it, and it stands below the chart
     x: Axis  #: the axes
@@ -245,12 +245,12 @@ def data_uri(values: Array, low: float, high: float) -> str:
 def colour_scale(low: float, high: float, label: str) -> Markup:
     """Return the scale of a map."""
     shades = element(
-        "image", href=data_uri(np.linspace(0, 1, 64)[None], 0, 1), width=200, height=10, x=140,
+        "image", href=data_uri(np.linspace(0, 1, 64)[None], 0, 1), width=200, height=10, x=140, y=6,
         preserveAspectRatio="none",
     )  # fmt: skip
-    ends = element("text", number(low), x=134, y=10, class_="tick up"), element("text", number(high), x=346, y=10)
-    name = element("text", label, x=240, y=28, class_="axis-label")
-    return element("svg", shades, *ends, name, viewBox="0 0 480 34", class_="chart scale", aria_hidden="true")
+    ends = element("text", number(low), x=134, y=16, class_="tick up"), element("text", number(high), x=346, y=16)
+    name = element("text", label, x=240, y=34, class_="axis-label")
+    return element("svg", shades, *ends, name, viewBox="0 0 480 40", class_="chart scale", aria_hidden="true")
 
 
 def _path(at: Array, class_: str, *, closed: bool = False) -> Markup:

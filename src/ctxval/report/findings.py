@@ -107,7 +107,7 @@ def _rests_on_distances(context: ReportContext) -> bool:
 def tasks_covered(context: ReportContext) -> Answer | None:
     """How far tasks are from every trial."""
     if context.suite is not None:
-        executed, tasks = len(context.suite) - len(context.suite.remaining(context.points)), len(context.suite)
+        executed, tasks = int((context.suite.executions(context.points) > 0).sum()), len(context.suite)
         text = f"{executed} of the {tasks} tasks of the suite were executed."
         return "good" if executed == tasks else "attention", text, {"executed": executed, "tasks": tasks}
     if not len(context.points) or not _rests_on_distances(context):
@@ -212,8 +212,9 @@ def not_tested(context: ReportContext) -> list[str]:
         left_out = at_most(100 * certificate.volume, 3)
         sentences.append(f"The certificate leaves out {left_out} % {of_tasks(certificate.distribution)}.")
     if context.suite is not None:
-        if len(left := context.suite.remaining(context.points)):
-            names = enumerated(map(context.suite.name_at, left), 20)
+        left = np.flatnonzero(context.suite.executions(context.points) == 0)
+        if len(left):
+            names = enumerated([context.suite.task_names[row] for row in left], 20)
             sentences.append(f"Tasks of the suite without a distance: {names}.")
     elif len(context.points):
         share, d = share_far_from_trials(context.points), context.space.dimension

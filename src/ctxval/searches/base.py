@@ -119,7 +119,7 @@ class BaseSearch(Search):
         """Take the notes on a history that was told: one for each point, in the order of the points."""
 
     def estimate(self, points: Array, values: Array) -> float | None:
-        """Return the largest known value after the ``discard`` largest are left out; None if there are too few."""
+        """Return the largest of values ``(N,)`` but for the ``discard`` largest; None if there are too few."""
         ordered = np.sort(values)[::-1]
         return float(ordered[self.discard]) if len(ordered) > self.discard else None
 
@@ -183,7 +183,7 @@ class SequentialSearch(BaseSearch):
                 self._append(point, value, None)
 
     def amend(self, point: Array) -> None:
-        """Replace the point that was asked for last by the one that is evaluated, which has fewer digits."""
+        """Replace the point ``(d,)`` that was asked for last by the one that is evaluated, which has fewer digits."""
         last = len(self._points) - 1
         key = _key(self._points[last])
         self._slots[key].remove(last)

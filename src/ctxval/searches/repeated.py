@@ -36,7 +36,7 @@ class Repeated(SequentialSearch):
         self._prediction = prediction
 
     def propose(self, rng: np.random.Generator) -> Array:
-        """Return the last point again if it needs more evaluations; else a new point."""
+        """Return the last point ``(d,)`` again if it needs more evaluations; else a new point."""
         points, groups = self.points, [np.array(rows) for rows in self._slots.values()]  # the rows of each point
         for rows in groups:
             if rows[-1] == len(points) - 1 and len(rows) < self.times:
@@ -54,7 +54,7 @@ class Repeated(SequentialSearch):
         return point
 
     def estimate(self, points: Array, values: Array) -> float | None:
-        """Return the estimate of the largest mean, from the points with at least ``times`` known values, if any."""
+        """Return the estimate of the largest mean, from points ``(N, d)`` with at least ``times`` values, if any."""
         groups: dict[bytes, list[int]] = {}
         for row, point in enumerate(points):
             groups.setdefault(point.tobytes(), []).append(row)

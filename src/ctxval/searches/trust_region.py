@@ -109,7 +109,7 @@ class TrustRegion(SequentialSearch):
         self._prediction = prediction
 
     def propose(self, rng: np.random.Generator) -> Array:
-        """Return the next point: by the first good prediction or, if there is none, by Bayesian optimisation."""
+        """Return the next point ``(d,)``: by the first good prediction or, without one, by Bayesian optimisation."""
         prediction, why, candidate = self._prediction, "there is no prediction", None
         surrogate_error = functools.cache(self._surrogate_error)  # all predictions are compared with the same one
         while prediction is not None:
@@ -329,7 +329,7 @@ class Auto(TrustRegion):
         super().use_prediction(prediction)
 
     def propose(self, rng: np.random.Generator) -> Array:
-        """Return the next point; if the number of designs is fixed at this choice, its note contains the number."""
+        """Return the next point ``(d,)``; if the number of designs is fixed at this choice, its note has the number."""
         point = super().propose(rng)
         if self._fixed_now is not None:
             self._last_note = {**(self._last_note or {}), **self._fixed_now}

@@ -55,6 +55,9 @@ EXECUTED_AGAIN = (
 )
 """The assumption of a statement about executed tasks alone."""
 
+INDEPENDENT_REPEATS = "executions of one task are independent, and later ones are like those that were recorded"
+"""The assumption of a statement about repeated tasks."""
+
 
 # Independent draws
 
@@ -163,16 +166,18 @@ IRREGULAR = (
 """What an envelope assumes if it is learned without some recorded steps."""
 
 
-def dynamics_statement(
-    upper: float, error: float, confidence: float, quantile: float | None = None, *, parametric: bool = False
-) -> str:
-    """Return the bound on d*, or on the quantile of the distance at the worst task, from learned dynamics."""
-    law = "the posterior of M's uncertain parameters" if parametric else "a Gaussian process of the residual dynamics"
-    bound = f"With {percent(confidence)} probability under {law}"
-    if quantile is not None:
-        which = f"the {quantile:g} quantile of the distance"
+def dynamics_statement(upper: float, error: float, confidence: float, evidence: Evidence) -> str:
+    """Return the bound on d*, or on a quantile over executions of the worst task or over the tasks, from dynamics."""
+    law = "a Gaussian process of the residual dynamics"
+    law = "the posterior of M's uncertain parameters" if evidence.is_parametric else law
+    shown = f"{upper:.6g}" if evidence.negligible else with_error(upper, error)
+    bound, what = f"With {percent(confidence)} probability under {law}", f"d* is at most {shown}"
+    if evidence.quantile is not None:
+        which = f"the {evidence.quantile:g} quantile of the distance"
         return f"{bound} with noise, {which} is at most {with_error(upper, error)} in every task."
-    return f"{bound}, d* is at most {with_error(upper, error)}."
+    if evidence.share < 1:
+        what = f"the distances of {100 * evidence.share:.4g} % of the tasks are at most {shown}"
+    return f"If {SMALL_ERRORS}, {what}." if evidence.negligible else f"{bound}, {what}."
 
 
 SMALL_ERRORS = "M errs nowhere by more than its largest error in a recorded step"
@@ -232,6 +237,11 @@ def dynamics_assumptions(evidence: Evidence) -> tuple[str, ...]:
         f"the search of {evidence.evaluations} closed loops on the learned dynamics found the largest distance of each "
         "posterior sample"
     )
+    if evidence.share < 1:
+        searched = (
+            f"the shares of tasks follow from {evidence.evaluations} closed loops of randomly drawn tasks, which "
+            "exaggerate each posterior sample's distance with a probability of 99 %"
+        )
     if evidence.is_parametric:
         return complete, alike, f"{_PARAMETRIC} ({in_words(evidence.parameters)})", searched, ANY_ORDER
     if evidence.negligible:

@@ -24,8 +24,14 @@ from ctxval.certificates.bounds import (
 )
 from ctxval.certificates.covering import RESOLUTION, EmptyBox
 from ctxval.certificates.sample import executions_of
-from ctxval.certificates.sentences.statements import SMALL_ERRORS, condition_on_dynamics, conditions_on_dynamics
+from ctxval.certificates.sentences.statements import (
+    INDEPENDENT_REPEATS,
+    SMALL_ERRORS,
+    condition_on_dynamics,
+    conditions_on_dynamics,
+)
 from ctxval.certificates.sentences.withdrawals import REFINED
+from ctxval.certificates.task_share import ShareBets
 from ctxval.core.learned_numbers import PushedDistances, Tolerance
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Trial, Trials
@@ -74,6 +80,20 @@ def falsified(
     )
 
 
+def share_falsified(
+    worst: Trial, tau: float, quantities: Quantities, bets: ShareBets, share: float, confidence: float
+) -> str:
+    """Return which share of the tasks exceeds a threshold, as executions alone show, and the largest of them."""
+    return (
+        f"with {percent(confidence)} confidence, more than {100 * bets.least:.3g} % of the tasks exceed "
+        f"{quantities.of(f'{tau:.6g}')}, and at most {100 * (1 - share):.3g} % may: {bets.above} of "
+        f"{counted(bets.executions, 'execution')} at drawn tasks exceed it (e-value {bets.wealth:.3g}, where "
+        f"{_needed(confidence)}). This rests on no model, only on the threshold being fixed before they were drawn; "
+        f"the largest distance is {quantities.of(f'{worst.least:.4g}')} in trial {worst.number}, in the task "
+        f"{quantities.task(worst).removeprefix('task ')}."
+    )
+
+
 def _needed(confidence: float) -> str:
     """Return which e-value rules noise out as the cause (Ville 1939)."""
     return f"{1 / (1 - confidence):.3g} is needed"
@@ -115,6 +135,12 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
     """Return what is validated in one sentence: which tasks stay below the threshold, by which bound, if what holds."""
     upper, limit = _bound_and_limit(certificate, tau, quantities)
     kind, details, level = certificate.kind, certificate.details, percent(certificate.confidence)
+    if kind == "suite" and details.get("quantile"):
+        return (
+            f"with {level} confidence, each of {counted(details['tasks'], 'task')} of the suite stays at or below "
+            f"{limit} in at least {100 * details['quantile']:g} % of its executions: the bound is {upper}, from at "
+            f"least {counted(details['repeats'], 'execution')} of each."
+        )
     if kind == "suite":
         return (
             f"all {details['tasks']} tasks of the suite were executed, and no distance exceeds {limit}: the largest is "
@@ -122,7 +148,7 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
         )
     tests, quantile = details.get("tests"), details.get("quantile")
     untested = "" if tests is None or tests["drawn"] else "no prediction was tested at drawn tasks (tests = 0); "
-    if certificate.volume:
+    if certificate.volume and kind != "dynamics":
         return (
             f"{untested}with {level} confidence, at most {at_most(100 * certificate.volume, 3)} % "
             f"{of_tasks(certificate.distribution)}{quantities.ranges} exceed {limit}: the {kind} bound is "
@@ -142,6 +168,9 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
             condition += f"{_gaps(resolution, quantities)} ({diagonals})"
     given = f"if {SMALL_ERRORS}" if details.get("negligible") else f"with {level} {condition}"
     keeps = f"every task{quantities.ranges} stays at or below {limit}{which}"
+    if certificate.volume:
+        share = f"{100 * (1 - certificate.volume):.4g} % {of_tasks(certificate.distribution)}"
+        keeps = f"at least {share}{quantities.ranges} stay at or below {limit}"
     return f"{untested}{keeps}: the {kind} bound is {upper}, {given}."
 
 
@@ -197,7 +226,7 @@ def rests_on(conditions: Sequence[str], certificate: Certificate, tau: float, kn
 
 def _evidence(certificate: Certificate, tau: float, quantities: Quantities) -> str:
     """Return what speaks for a bound on d*: executions, tests of predictions, and what the bound survives."""
-    if certificate.volume or certificate.kind == "suite":
+    if (certificate.volume and certificate.kind != "dynamics") or certificate.kind == "suite":
         return ""
     details, text = certificate.details, str(counted(certificate.trials, "execution"))
     best, tests, left = details.get("best"), details.get("tests"), details.get("not_executed")
@@ -280,6 +309,8 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
                 once = f"the noise being normal and alike everywhere ({bounded})"
             return [f"the distance being as smooth between the trials as at them{where}", once]
         case "suite":
+            if details.get("quantile"):
+                return [INDEPENDENT_REPEATS]
             return ["an execution of a task again giving the distance that was recorded"]
         case "audit" | "anytime" | "scenario" | "sampling-discarding":
             return [
@@ -318,6 +349,8 @@ def _not_selected(known: Provenance, count: int, tau: float) -> list[str]:
     if not others:
         return [*sentences, alone]
     lie = "store of this experiment lies" if others == 1 else "stores of this experiment lie"
+    if all(other.worst is None for other in known.beside):
+        return [*sentences, f"{alone} ({others} other {lie} beside it)"]
     which = "none of them falsifies the threshold" if others > 1 else "it does not falsify the threshold"
     falsifying = [quoted(other.path.name) for other in known.beside if other.falsifies(tau)]
     if falsifying:
@@ -344,6 +377,9 @@ def undecided(certificate: Certificate, tau: float, volume: float, quantities: Q
     upper, limit = _bound_and_limit(certificate, tau, quantities)
     if certificate.upper_bound > tau:
         why = f"no distance above {limit} was executed, but d* may be up to {upper}"
+        if certificate.volume:
+            share = f"{100 * certificate.volume:.4g} % {of_tasks(certificate.distribution)}"
+            why = f"{share} may have distances up to {upper} and more, and the threshold is {limit}"
         if (quantile := certificate.details.get("quantile")) is not None:
             share = f"{100 * quantile:g} % of the executions of a task"
             why = f"{share} may have distances of up to {upper}, and the threshold is {limit}"

@@ -32,7 +32,6 @@ from ctxval.distances import UnsafeMargin
 from ctxval.errors import CertificateError, InputError, UnknownNameError
 from ctxval.models import Refined, read_refined
 from ctxval.studies.aspect1 import TASKS
-from ctxval.studies.safety import judged_by
 
 Part = dict[str, Any]  #: a table with a type, which may be ``module:attr``, and its arguments
 
@@ -45,6 +44,7 @@ class CertificateTable(BaseModel, extra="allow"):
     tests: int = Field(default=TESTS, ge=0, strict=True)  #: executions at drawn tasks, predicted beforehand
     #: the share of the executions of each task that the verdict is about, if they differ by noise
     quantile: float = Field(default=QUANTILE, ge=0.5, lt=1, strict=True)
+    share: float = Field(default=1.0, ge=0.5, le=1, strict=True)  #: of the tasks that the verdict is about
     #: the largest distance between a task and its nearest trial, in diagonals of the task space
     resolution: float = Field(default=RESOLUTION, gt=0, allow_inf_nan=False, strict=True)
     discard: int | None = Field(default=None, ge=0)  #: the largest distances, for ``sampling-discarding``
@@ -112,6 +112,8 @@ class SpecTable(BaseModel, extra="allow"):
 
     def on(self, experiment: Experiment) -> Experiment:
         """Return an experiment that judges the specification in place of its distance; the threshold is the margin."""
+        from ctxval.studies.safety import judged_by  # imported here, because few files have a specification
+
         return judged_by(experiment, UnsafeMargin({"type": self.type, **(self.model_extra or {})}, margin=self.margin))
 
 
@@ -219,8 +221,9 @@ class ExperimentSettings(BaseModel, extra="forbid"):
         if RECORDED in (self.task, self.synthesizer) and not isinstance(system, Recorded):
             raise InputError(f"tasks and inputs of the type {RECORDED['type']!r} need a system of the type Recorded.")
         box = {name: tuple(bounds) for name, bounds in (self.space or {}).items()}
+        repeats = system.repeats if isinstance(system, Recorded) else 1
         tasks: Any = system.names if self.suite is None and self.space is None else self.suite
-        space = TaskSpace(**box) if tasks is None else TaskSuite(tasks)
+        space = TaskSpace(**box) if tasks is None else TaskSuite(tasks, None, repeats)
         outputs: Any = self.outputs
         if isinstance(self.outputs, dict):
             require_known("entry of outputs", self.outputs, ["ref"])

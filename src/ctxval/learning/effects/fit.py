@@ -12,6 +12,7 @@ import scipy
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
+from ctxval.core.state_geometry import geometry_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.effects.effect import Effect, EffectCandidate
 from ctxval.learning.effects.flow import Linearisation
@@ -37,6 +38,7 @@ class Predictions(ShortRepr):
     steps: int
     states: Rows  #: rows of the first state and, in all padded runs, of the first input, ``(N,)``
     inputs: Rows
+    runs: Rows  #: the numbers of the executions ``(N,)``
     floors: Array  #: residuals ``(n,)`` that are too small to be evidence
 
 
@@ -55,8 +57,10 @@ class Segments:
         most: tuple[int, int] = (600, 120),
         settings: SegmentSettings = SegmentSettings(),
         known: tuple[Effect, ...] = (),
+        numbers: Sequence[int] | None = None,
     ) -> None:
-        self.settings = settings
+        self.numbers: Rows = np.array(range(len(runs)) if numbers is None else numbers)  # of the executions
+        self.settings, self._geometry = settings, geometry_of(model)
         self.model, self.known, self.horizons = model, known, [len(run.inputs) for run in runs]
         self.states = np.concatenate([run.states for run in runs])
         self.inputs = np.zeros((len(runs), max(self.horizons), runs[0].inputs.shape[1]))
@@ -67,22 +71,23 @@ class Segments:
         for number, length in enumerate(settings.steps):
             window = self._window(min(length, min(self.horizons)), most[number])
             left = self.left_by(ModelWithEffects(model, ()), window)
-            changes = _size(self._gap(self.states[window.states + window.steps] - self.states[window.states]))
+            changes = _size(self._gap(self.states[window.states + window.steps], self.states[window.states]))
             # Smaller residuals are no segments.
             least = np.hypot(0.01 * _size(left), 1e-3 * changes) if floors is None else floors[number]
             self.windows.append(replace(window, floors=np.maximum(least, 1e-15)))
             self.sizes.append(np.maximum(_size(left), self.windows[-1].floors))
 
     def _window(self, steps: int, most: int) -> Predictions:
-        states, inputs, first = [], [], 0
+        states, inputs, runs, first = [], [], [], 0
         for number, horizon in enumerate(self.horizons):
             begins = np.arange(0, horizon - steps + 1, max(1, steps // 2))
             states.append(first + begins)
             inputs.append(number * self.inputs.shape[1] + begins)
+            runs.append(np.full(len(begins), self.numbers[number]))
             first += horizon + 1
-        of_states, of_inputs = np.concatenate(states), np.concatenate(inputs)
+        of_states, of_inputs, of_runs = map(np.concatenate, (states, inputs, runs))
         rows = np.linspace(0, len(of_states) - 1, min(len(of_states), most)).round().astype(np.intp)
-        return Predictions(steps, of_states[rows], of_inputs[rows], np.zeros(self.states.shape[1]))
+        return Predictions(steps, of_states[rows], of_inputs[rows], of_runs[rows], np.zeros(self.states.shape[1]))
 
     @property
     def pairs(self) -> tuple[Array, Array, Array]:
@@ -106,17 +111,19 @@ class Segments:
         Predictions begin at recorded states that are moved.
         """
         draws = (repaired.draws,) if repaired.draws else ()
-        acting = repaired.acting(np.broadcast_to(self.inputs, (*draws, *self.inputs.shape)))
+        acting = repaired.in_run(self.numbers).acting(np.broadcast_to(self.inputs, (*draws, *self.inputs.shape)))
+        repaired = repaired.in_run(window.runs)
         acting = acting.reshape(*draws, -1, *acting.shape[len(draws) + 2 :])
-        begun = self.states[window.states] + moved
+        begun = self._geometry.add(self.states[window.states], np.zeros(self.states.shape[1]) + moved)
         x = repaired.true(np.broadcast_to(begun, (*draws, *begun.shape)))
         moved_back = any(type(effect).true is not Effect.true for effect in repaired.effects)
         for k in range(window.steps):
             at = None if moved_back else self.linearised[window.states + k]
             x = repaired.reached(x, acting.take(window.inputs + k, axis=len(draws)), at)
-        return self._gap(repaired.recorded(x) - self.states[window.states + window.steps])
+        return self._gap(repaired.recorded(x), self.states[window.states + window.steps])
 
-    def _gap(self, difference: Array) -> Array:
+    def _gap(self, states: Array, others: Array) -> Array:
+        difference = self._geometry.difference(states, others)
         return functools.reduce(lambda difference, effect: effect.gap(difference), self.known, difference)
 
     def noise(self, repaired: ModelWithEffects) -> Array:
@@ -126,7 +133,8 @@ class Segments:
         # The noise of a measurement enters two successive residuals, with opposite signs.
         runs = np.split(left, np.cumsum(self.horizons)[:-1])
         products = np.concatenate([run[1:] * run[:-1] for run in runs])
-        window = replace(self.windows[0], states=self.windows[0].states[::4], inputs=self.windows[0].inputs[::4])
+        first = self.windows[0]
+        window = replace(first, states=first.states[::4], inputs=first.inputs[::4], runs=first.runs[::4])
         here, slopes = self.left_by(repaired, window), np.ones(left.shape[1])
         for i, size in enumerate(0.1 * self.sizes[0]):
             there = self.left_by(repaired, window, size * np.eye(len(slopes))[i])
@@ -153,7 +161,7 @@ class Segments:
         settings = self.settings
         window, rng = self._window(steps, len(self.states)), np.random.default_rng(0)
         if steps not in self._missed:
-            changes = _size(self._gap(self.states[window.states + steps] - self.states[window.states]))
+            changes = _size(self._gap(self.states[window.states + steps], self.states[window.states]))
             missed = _size(self.left_by(ModelWithEffects(self.model, ()), window))
             self._missed[steps] = missed, missed > 2e-3 * np.maximum(changes, 1e-12)
         sizes, matter = self._missed[steps]

@@ -37,12 +37,8 @@ def distances(context: ReportContext) -> Markup:
     if d == 1 or context.suite is not None:
         return joined([element("div", predicted, class_="charts")])
     parts = [paragraph("Lines, bands and maps are pictures of what the trials suggest, and no certificate.")]
-    if d == 2:
-        values = (_estimated(context, _grid_of_tasks()) or model.predict(_grid_of_tasks())).median
-        values = np.nan_to_num(values, nan=float(context.distances.max()))
-        title = "Map of the distance over the two parameters, with the executed tasks"
-        drawn = _map(context, title, values, context.distance_label)
-        parts.append(element("div", drawn, *(distance_along(context, axis) for axis in range(2)), class_="charts"))
+    if d == 2:  # the map is on the first screen
+        parts.append(element("div", *(distance_along(context, axis) for axis in range(2)), class_="charts"))
     else:
         axes = model.influence[:12]
         if d > len(axes):
@@ -75,6 +71,18 @@ def _estimated(context: ReportContext, unit: Array) -> Band | None:
     return None if model is None else model.predict(unit)
 
 
+def over_tasks(context: ReportContext) -> Markup | Chart | None:
+    """Return the picture of the first screen: the distance over the task space; None if no distance is known.
+
+    It is a curve over one parameter, a map over two, or a map over the two to which the distance is most sensitive.
+    A suite has no tasks between its own, so its distances are in the order of execution.
+    """
+    picture: Markup | Chart | None = None
+    if context.suite is None and context.completed:
+        picture = distance_along(context, 0) if context.space.dimension == 1 else _map(context)
+    return picture or distances_in_order(context)
+
+
 def distance_along(context: ReportContext, axis: int, *, small: bool = False) -> Chart | None:
     """Return the distance along one parameter, through the worst executed task; None if it cannot be estimated."""
     if not context.worst_first:
@@ -102,6 +110,7 @@ def distance_along(context: ReportContext, axis: int, *, small: bool = False) ->
     chart.limit(context.threshold, "threshold", "threshold").limit(context.bound, "bound", "bound on d*")
     if space.dimension == 1:
         _add_trials(chart, context, 0)
+        _add_next(chart, context, 0)
     _add_marks(chart, context, [worst], (axis, None), "worst", "worst executed task")
     return chart
 
@@ -130,30 +139,50 @@ def _add_marks(
     chart.marks(at[:, x], distances if y is None else at[:, y], kind, label, names)
 
 
-def _grid_of_tasks() -> Array:
-    """Return the tasks of a map, points of the unit cube ``(_GRID**2, 2)``."""
-    side = np.linspace(0, 1, _GRID)
-    return np.stack(np.meshgrid(side, side, indexing="xy"), axis=-1).reshape(-1, 2)
+def _map(context: ReportContext) -> Markup | None:
+    """Return a map of the distance with the executed tasks and the edge of the threshold; None if it cannot be fitted.
 
-
-def _map(context: ReportContext, title: str, values: Array, label: str) -> Markup:
-    """Return a map of values on the grid of tasks, with the edge of the threshold and the executed tasks."""
+    The parameters that it does not show are those of the worst executed task.
+    """
+    model, space, worst = context.distance_model, context.space, context.worst_first[0]
+    if model is None:
+        return None
+    i, j = axes = sorted(model.influence[:2]) if space.dimension > 2 else [0, 1]
+    side, unit = np.linspace(0, 1, _GRID), np.tile(worst.unit_point, (_GRID**2, 1))
+    unit[:, axes] = np.stack(np.meshgrid(side, side, indexing="xy"), axis=-1).reshape(-1, 2)
+    values = (_estimated(context, unit) or model.predict(unit)).median
+    values = np.nan_to_num(values, nan=float(context.distances.max()))
     tau, top = context.threshold, max(float(values.max()), float(context.distances.max()))
-    chart = Chart(title, _parameter_axis(context.space, 0), _parameter_axis(context.space, 1), height=360)
+    title = f"Distance over {space.labels[i]} and {space.labels[j]}, with the executed tasks"
+    title += "" if space.dimension == 2 else "; other parameters as in the worst executed task"
+    chart = Chart(title, _parameter_axis(space, i), _parameter_axis(space, j), height=330)
     chart.image(values.reshape(_GRID, _GRID), 0.0, top)
     if tau is not None and (values > tau).any() and (values <= tau).any():
         # The edge of the region above the threshold lies between the cells of the map.
         above = (values > tau).reshape(_GRID, _GRID)
-        grid = context.space.from_unit(_grid_of_tasks()).reshape(_GRID, _GRID, 2)
+        grid = space.from_unit(unit)[:, axes].reshape(_GRID, _GRID, 2)
         half = 0.5 * (grid[1, 1] - grid[0, 0])
         across = grid[:, :-1][above[:, 1:] != above[:, :-1]]
         along = grid[:-1][above[1:] != above[:-1]]
         upright = np.stack([across + half * [1, -1], across + half], axis=1)
         level = np.stack([along + half * [-1, 1], along + half], axis=1)
         chart.edges(np.concatenate([upright, level]), "edge of the region above the threshold")
-    _add_trials(chart, context, 0, 1)
-    _add_marks(chart, context, [context.worst_first[0]], (0, 1), "worst", "worst executed task")
-    return chart.render(colour_scale(0.0, top, label))
+    _add_trials(chart, context, i, j)
+    _add_marks(chart, context, [worst], (i, j), "worst", "worst executed task")
+    _add_next(chart, context, i, j)
+    return chart.render(colour_scale(0.0, top, context.distance_label))
+
+
+def _add_next(chart: Chart, context: ReportContext, x: int, y: int | None = None) -> None:
+    """Add the next tasks: the open trials, or the one that the verdict advises."""
+    points = [trial.unit_point for trial in context.trials if trial.state == "open"]
+    task = None if context.verdict is None else context.verdict.next_task
+    at = context.space.from_unit(np.array(points)) if points else None
+    if at is None and task is not None:
+        at = np.asarray(context.space.point(task)).reshape(1, -1)
+    if at is not None:
+        height = np.full(len(at), 0.03 * chart.y.ends[1]) if y is None else at[:, y]
+        chart.marks(at[:, x], height, "corrected", "next task", ["next task"] * len(at))
 
 
 def _predicted(context: ReportContext, model: DistanceModel) -> Chart:

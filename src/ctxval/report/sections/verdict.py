@@ -14,7 +14,7 @@ from ctxval.report.context import ReportContext
 from ctxval.report.distance_model import distance_of
 from ctxval.report.findings import WORDS, Finding
 from ctxval.report.markup import UNCUT, bullets, element, heading, joined, paragraph, percent, quantity, table, text
-from ctxval.report.sections.distances import distance_along, distances_in_order, envelope
+from ctxval.report.sections.distances import envelope, over_tasks
 from ctxval.report.sections.repeat import command_of, command_snippet, path_of
 from ctxval.report.sections.trials import task_of
 
@@ -29,9 +29,7 @@ def verdict(context: ReportContext) -> Markup:
     """Return the first screen: the verdict, its sentence, the picture, the next step and the numbers."""
     answer = "no verdict" if context.verdict is None else context.verdict.answer
     word = element("p", _shape(answer), " ", answer.capitalize(), class_="word")
-    curve = distance_along(context, 0) if context.space.dimension == 1 and context.suite is None else None
-    chart = curve or distances_in_order(context)
-    picture = element("div", chart or paragraph("No distance is known yet."), class_="picture")
+    picture = element("div", over_tasks(context) or paragraph("No distance is known yet."), class_="picture")
     advice, command = _next(context)
     block = markup.code(command, "Next command") if command else None
     beside = element("div", heading("What next"), paragraph(advice), block, _facts(context), *_remarks(context))
@@ -101,8 +99,10 @@ def _facts(context: ReportContext) -> Markup:
     if certificate is not None:
         how = "withdrawn" if certificate.doubt is not None else f"{percent(certificate.confidence)} confidence"
         bound = f"{with_error(certificate.upper_bound, certificate.error)} {units}".rstrip()
-        rows.append(("Bound on all tasks", f"{bound} ({certificate.kind}, {how})"))
-        if certificate.volume:
+        share = certificate.details.get("share")
+        tasks = "all tasks" if share is None else f"{100 * share:.4g} % of the tasks"
+        rows.append((f"Bound on {tasks}", f"{bound} ({certificate.kind}, {how})"))
+        if certificate.volume and share is None:
             rows.append(("Tasks left out", f"{at_most(100 * certificate.volume, 3)} %"))
     if verdict is not None:
         rows.append(("Threshold", quantity(verdict.threshold, units)))
