@@ -70,7 +70,9 @@ class Pair:
 
 
 DEVELOPMENT = {
-    "delay and dry friction": Pair("maglev", lambda dt: (Delay((2.0,)), Coulomb((0.15,), Joint(1, 0, input=0), 0.1, dt))),
+    "delay and dry friction": Pair(
+        "maglev", lambda dt: (Delay((2.0,)), Coulomb((0.15,), Joint(1, 0, input=0), 0.1, dt))
+    ),
     "backlash and payload": Pair("arm", lambda dt: (Backlash((0.2,), 0), InputGain((0.85,), 1))),
     "drift and noise": Pair("ship", lambda dt: (InputDrift((0.08,), 0, dt),), 1e-3),
     "dead zone and delay": Pair("tanks", lambda dt: (DeadZone((0.25,), 0), Delay((1.0,)))),
