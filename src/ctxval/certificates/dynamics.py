@@ -196,7 +196,7 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
         doubt=doubt,
         withdrawn_by=None if doubt is None else withdrawn_by,
         error=error,
-        volume=1 - evidence.share,
+        volume=round(1 - evidence.share, 12),
     )
 
 
