@@ -200,7 +200,8 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
     )
 
 
-def _tests_alone(sample: Sample, level: float, confidence: float) -> dict[str, float | int]:
+def _tests_alone(sample: Sample, level: float, confidence: float) -> dict[str, float | None]:
     """Return which share of the tasks exceeds a level at most, by all independent draws, and how many of these do."""
     above = ~(sample.only("iid").distances <= level)
-    return {"share_missed": anytime_volume(above, 1 - confidence), "above": int(above.sum())}
+    missed = anytime_volume(above, 1 - confidence) if len(above) else None
+    return {"share_missed": missed, "above": int(above.sum())}
