@@ -11,7 +11,7 @@ export OMP_NUM_THREADS = 1
 unexport PYTHONDONTWRITEBYTECODE
 PIP := -m pip install --quiet --disable-pip-version-check --no-compile
 
-.PHONY: demo test suite quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine frozen reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo robots watch envelope friction safety causes dist clean
+.PHONY: demo test suite quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine frozen reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo robots watch envelope friction safety share causes dist clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -78,10 +78,11 @@ docs: .venv/.test  ## the manual, with its gallery; writes docs/_build/html, and
 frozen: .venv/.test  ## do stored campaigns still end and choose as they did? Nothing is executed
 	$(BIN)/python benchmarks/frozen_replay.py --workers 2
 
-pictures: .venv/.test  ## those of the README and of the manual; needs Chromium
+pictures: .venv/.test  ## those of the README and of the manual; needs Chromium and EGL
 	$(BIN)/ctxval run pendulum --search gp-ucb --seed 1 --store docs/pictures/pendulum.sqlite --no-report
 	rm docs/pictures/pendulum.sqlite
 	$(BIN)/python benchmarks/report_picture.py
+	$(BIN)/python benchmarks/robot_picture.py
 
 calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/calibration.md, and resumes
 	$(BIN)/python benchmarks/calibrate.py --campaigns $(CAMPAIGNS)
@@ -125,6 +126,9 @@ envelope: .venv/.test  ## which part of the true set envelopes find; writes docs
 
 friction: .venv/.test  ## how campaigns on systems with dry friction end; writes docs/dry-friction.md, and resumes
 	$(BIN)/python benchmarks/study_friction.py
+
+share: .venv/.test  ## verdicts on 99 % of the tasks; writes docs/how-to/share.md, and resumes
+	$(BIN)/python benchmarks/study_share.py
 
 causes: .venv/.test  ## does `ctxval why` name the fault of a robot? Writes docs/how-to/causes.md, and resumes
 	$(BIN)/python benchmarks/study_causes.py development

@@ -18,7 +18,7 @@ from landed import Ratio, beside_landed, report
 RELEASE = "23bd7a97"
 """The revision of the last release, 0.2.0."""
 
-REPEATS = 7
+REPEATS = 5
 NUMPY = "import numpy"
 STORE = "demo.sqlite"
 CTXVAL = ("-c", "from ctxval.cli import main; main()")

@@ -28,9 +28,16 @@ from rig_cli import calling
 HOW_TO = sorted((DOCS / "how-to").glob("*.md"))
 PAGES = [*HOW_TO, *sorted(DOCS.glob("tutorials/*.md")), *sorted(DOCS.glob("explanation/*.md"))]
 PAGES += sorted(DOCS.glob("reference/*.md"))
-NEEDS = {"gymnasium": ["gymnasium", "mujoco"], "mujoco": ["mujoco"], "fmu": ["fmpy", "pythonfmu"], "mpc": ["casadi"]}
-NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn"], "state-space": ["control"]}
-NEEDS |= {"policy-and-mjcf": ["mujoco"]}
+NEEDS = {
+    "gymnasium": ["gymnasium", "mujoco"],
+    "mujoco": ["mujoco"],
+    "robot-knowledge": ["mujoco"],
+    "fmu": ["fmpy", "pythonfmu"],
+    "mpc": ["casadi", "do_mpc"],
+}
+NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn", "pysindy"], "state-space": ["control"]}
+NEEDS |= {"policy-and-mjcf": ["mujoco"], "flight-logs": ["pyulog"], "ros-bags": ["rosbags", "mcap"]}
+NEEDS |= {"robot-datasets": ["h5py", "pyarrow"]}
 NEEDS |= {"pybullet": ["mujoco", "pybullet"]}
 NEEDS |= {"gymnasium-and-network": ["gymnasium", "mujoco", "sklearn"]}
 NEEDS |= {"fit": ["mujoco", "sklearn", "onnx"]}

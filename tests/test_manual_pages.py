@@ -157,5 +157,6 @@ def test_the_gallery_has_every_case() -> None:
 
 
 def test_the_picture_of_the_readme_is_small() -> None:
-    assert "docs/pictures/report.png" in (ROOT / "README.md").read_text()
-    assert (ROOT / "docs" / "pictures" / "report.png").stat().st_size < 200_000
+    assert "docs/pictures/robot.png" in (ROOT / "README.md").read_text()
+    for name in ("report.png", "robot.png"):
+        assert (ROOT / "docs" / "pictures" / name).stat().st_size < 200_000

@@ -17,6 +17,7 @@ import study_envelope
 import study_friction
 import study_main_job
 import study_refine
+import study_share
 from peers import page as peers_page
 
 
@@ -32,7 +33,12 @@ STUDIES = {
     "refinement": study_refine.page,
     "benchmarks": peers_page.page,
 }
-OTHERS = {"servo": servo_page.page, "envelope": study_envelope.page, "dry-friction": study_friction.page}
+OTHERS = {
+    "servo": servo_page.page,
+    "envelope": study_envelope.page,
+    "dry-friction": study_friction.page,
+    "share": study_share.page,
+}
 """Pages that do not say with which sources their results were measured."""
 
 

@@ -37,6 +37,33 @@ def ulog(path: Path, topics: dict[str, tuple[str, np.ndarray, np.ndarray]], boot
     return path
 
 
+def dataflash(path: Path, topics: dict[str, tuple[str, str, np.ndarray, np.ndarray]], boot: float = 12.5) -> Path:
+    """Write a log of ArduPilot, https://ardupilot.org/dev/docs/logmessages.html: names, ids of units, times, values."""
+
+    def message(kind: int, form: str, *values: object) -> bytes:
+        return struct.pack(f"<3B{form}", 0xA3, 0x95, kind, *values)
+
+    def format_of(kind: int, name: str, form: str, columns: str) -> bytes:
+        sizes = {"Q": "Q", "f": "f", "B": "B", "b": "b", "N": "16s", "Z": "64s", "d": "d"}
+        length = 3 + struct.calcsize("<" + "".join(sizes[each] for each in form))
+        return message(0x80, "BB4s16s64s", kind, length, name.encode(), form.encode(), columns.encode())
+
+    parts = [format_of(100, "UNIT", "QbZ", "TimeUS,Id,Label")]
+    parts += [format_of(101, "FMTU", "QBNN", "TimeUS,FmtType,UnitIds,MultIds")]
+    parts += [message(100, "Qb64s", 0, ord(key), unit.encode()) for key, unit in (("s", "s"), ("d", "deg"), ("#", "i"))]
+    for kind, (name, (columns, ids, _, values)) in enumerate(topics.items(), 1):
+        form = "B" * ids.count("#") + "f" * (values.shape[1] - ids.count("#"))
+        parts.append(format_of(kind, name, f"Q{form}", f"TimeUS,{columns}"))
+        parts.append(message(101, "QB16s16s", 0, kind, f"s{ids}".encode(), b"-" * (1 + len(ids))))
+    for kind, (_, ids, times, values) in enumerate(topics.values(), 1):
+        form = "B" * ids.count("#") + "f" * (values.shape[1] - ids.count("#"))
+        for time, row in zip(times, values, strict=True):
+            first = [int(value) for value in row[: ids.count("#")]]
+            parts.append(message(kind, f"Q{form}", round(1e6 * (boot + time)), *first, *row[len(first) :]))
+    path.write_bytes(b"".join(parts))
+    return path
+
+
 def table(path: Path, names: str, times: np.ndarray, values: np.ndarray) -> Path:
     stamps = [f"{round(1e6 * (328.8 + time))}" for time in times]
     rows = [",".join([stamp, *map(repr, row)]) for stamp, row in zip(stamps, values.tolist(), strict=True)]
@@ -80,6 +107,33 @@ def test_a_damaged_log_of_px4_is_refused(content: bytes, tmp_path: Path) -> None
     (tmp_path / "a.ulg").write_bytes(content)
     with refuses(InputError, "a.ulg"):
         read_logs([tmp_path / "a.ulg"])
+
+
+def test_a_log_of_ardupilot_is_read_with_its_units_and_instances(tmp_path: Path) -> None:
+    pytest.importorskip("pymavlink")
+    roll, numbers = np.degrees(np.sin(FAST))[:, None], np.arange(len(FAST))[:, None] % 2
+    topics = {
+        "ATT": ("Roll", "d", FAST, roll),
+        "RCO": ("C1", "-", SLOW, SLOW[:, None]),
+        "IMU": ("I,Gyr", "#-", FAST, np.hstack([numbers, RATES[:, 1:2]])),
+    }
+    path = dataflash(tmp_path / "flight.bin", topics)
+    (log,) = read_logs([path])
+    assert {"Roll [deg]", "C1", "IMU_0.Gyr", "IMU_1.Gyr"} <= set(log.fields())
+    mapping = {"states": {"roll": {"path": "Roll", "unit": "rad"}, "rate": "IMU_0.Gyr"}, "inputs": {"u": "C1"}}
+    recordings = read_recordings([path], LogMapping.from_table(mapping))
+    (run,) = recordings.runs
+    assert recordings.dt == pytest.approx(0.004)
+    times = run.start - 12.5 + run.trajectory.times
+    np.testing.assert_allclose(run.trajectory.states, np.column_stack([np.sin(times), np.cos(times)]), atol=1e-4)
+
+
+@pytest.mark.parametrize("content", [b"", bytes(600), b"\xa3\x95\x80\x80\x59FMT"])
+def test_a_file_that_is_no_log_of_ardupilot_is_refused(content: bytes, tmp_path: Path) -> None:
+    pytest.importorskip("pymavlink")
+    (tmp_path / "a.bin").write_bytes(content)
+    with refuses(InputError, "a.bin"):
+        read_logs([tmp_path / "a.bin"])
 
 
 def test_files_of_topics_are_one_recording_for_each_flight(tmp_path: Path) -> None:

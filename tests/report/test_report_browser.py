@@ -20,7 +20,7 @@ from rig_thorough import more
 LARGEST = 1_500_000
 """Bytes of a report."""
 
-FIRST = ".answer .word, .answer .sentence, .picture svg.chart, .first h3 + p"
+FIRST = ".answer .word, .answer .sentence, .picture svg.chart:not(.scale), .first h3 + p"
 """The verdict, its sentence, its picture and what to do next."""
 
 LOWEST = f"Math.max(...[...document.querySelectorAll('{FIRST}')].map((one) => one.getBoundingClientRect().bottom))"

@@ -74,15 +74,19 @@ def test_names_units_threshold_and_verdict_are_on_the_page(html: str) -> None:
     assert "</span> Falsified</p>" in html
 
 
-@pytest.mark.parametrize(
-    ("dimension", "facts"),
-    [(2, ()), (5, ())],
-)
-def test_the_charts_suit_the_number_of_parameters(dimension: int, facts: tuple[object, ...]) -> None:
+@pytest.mark.parametrize("dimension", [2, 5])
+def test_the_first_screen_is_a_map_of_the_parameters_that_matter(dimension: int) -> None:
     found = report.page(context_of_campaign(plane(dimension)))
-    assert_names(found, *facts)
-    assert "Sensitivity" in found
+    first, _, others = found.partition('id="section-2"')
+    assert (first.count('class="map"'), others.count('class="map"')) == (1, 0)
+    assert "Sensitivity" in others
     assert not broken(found)
+
+
+def test_the_next_task_is_marked_on_the_map() -> None:
+    campaign = plane(2)
+    campaign.ask({"a": 0.5, "b": -0.5})
+    assert "<title>next task</title>" in report.page(context_of_campaign(campaign))
 
 
 def test_a_report_of_nothing_says_so() -> None:

@@ -155,7 +155,7 @@ def test_a_form_needs_the_token_of_its_session(server: Server, page: Response, f
 
 def test_another_site_cannot_embed_or_read_the_page_but_may_link_to_it(server: Server, page: Response) -> None:
     fetched = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "no-cors", "Sec_Fetch_Dest": "image"}
-    assert server.request("GET", "/pictures/distance.svg", Cookie=page.cookie, **fetched).status == 403
+    assert server.request("GET", "/trials/0/files/task.json", Cookie=page.cookie, **fetched).status == 403
     linked = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate", "Sec_Fetch_Dest": "document"}
     assert server.request("GET", "/", Cookie=page.cookie, **linked).status == 200
     framed = {**linked, "Sec_Fetch_Dest": "iframe"}
@@ -291,7 +291,6 @@ def test_nonsense_is_refused(server: Server, page: Response) -> None:
     for path in (
         "/trials/0/files/..%2f..%2fa",
         "/trials/3/files/task.json",
-        "/pictures/nothing.svg",
         "/static/..%2fapp.py",
     ):
         assert server.request("GET", path, Cookie=page.cookie).status == 404, path
@@ -345,10 +344,7 @@ def test_a_campaign_by_hand_by_forms_alone(tmp_path: Path) -> None:
         wait_for(server, 'id="trial-3"', page)
         assert post(server, "/choose", page, {"how": "draw", "seen": "4"}).status == 303
         wait_for(server, 'id="trial-4"', page)
-        wait_for(server, "/pictures/distance.svg", page)
-        picture = server.request("GET", "/pictures/distance.svg", Cookie=page.cookie)
-        assert picture.text.startswith("<?xml")
-        assert "sandbox" in picture.headers["content-security-policy"]
+        wait_for(server, 'class="chart"', page)
         archive = zipfile.ZipFile(io.BytesIO(server.request("GET", "/trials/3/files.zip", Cookie=page.cookie).content))
         files = [f"trial-3/{name}" for name in ("controller.json", "controller.npz", "model.csv", "task.json")]
         assert sorted(archive.namelist()) == files
@@ -449,7 +445,7 @@ def test_other_computers_need_the_token_and_the_store_may_be_run_elsewhere(tmp_p
         assert len(token) == 32
         bare = server.request("GET", "/")
         assert (bare.status, "set-cookie" in bare.headers, "Trial 0" in bare.text) == (401, False, False)
-        for path in ("/events", "/trials/0/files/task.json", "/pictures/distance.svg"):
+        for path in ("/events", "/trials/0/files/task.json"):
             assert server.request("GET", path).status == 401
         wrong = server.request("GET", "/?token=" + token[:-1])
         assert (wrong.status, "set-cookie" in wrong.headers) == (401, False)

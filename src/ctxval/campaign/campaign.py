@@ -26,6 +26,7 @@ from ctxval._util.progress import progress_shown, stage
 from ctxval._util.representation import call
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
+from ctxval.campaign.dynamics import SENSITIVITY
 from ctxval.campaign.envelope import EnvelopeSearch
 from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.executors import Executor, worker_pool
@@ -51,6 +52,7 @@ from ctxval.core.trial import Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError, CtxvalError, InputError
 from ctxval.gp.surrogate import Surrogate, fit_surrogate
+from ctxval.learning.sensitivity import Sensitivity
 from ctxval.searches import Auto, Search
 
 if TYPE_CHECKING:
@@ -153,6 +155,12 @@ class Campaign:
     def worst(self) -> Trial | None:
         """The completed trial with the largest distance."""
         return self.trials.worst
+
+    @property
+    def sensitivity(self) -> Sensitivity | None:
+        """How far small changes move closed loops of M if these are not smooth, as found before the first execution."""
+        notes = (trial.note or {} for trial in self.trials[:1])
+        return next((Sensitivity.from_json(note.get(SENSITIVITY)) for note in notes), None)
 
     def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
         """Return the trajectories of the model and of the system in a trial; None if a trajectory is not stored.
@@ -291,6 +299,8 @@ class Campaign:
             self.state_threshold(threshold)
         predicts = decides is not None and decides.predicts
         with self.recorder.predicting(predicts, thinking), progress_shown(progress):
+            if predicts and not self.trials and options.kind.share == 1:
+                self.recorder.dynamics.find_sensitivity(threshold)
             ExecutionLoop(
                 self.recorder,
                 rule,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -33,11 +34,13 @@ from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.coverage import unsampled_corner
 from ctxval.learning.prediction import Executed
+from ctxval.learning.sensitivity import Sensitivity, found_sensitivity
 from ctxval.learning.stage_costs import Ledger
 from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
 
+SENSITIVITY = "sensitivity"  #: key of a :class:`Sensitivity` in the note of the first trial
 PREDICTION = "prediction"  #: key of the prediction of an execution in the note of its trial
 NEAR = 0.02  #: a task that differs from an executed one by less than this in every coordinate is no new one
 
@@ -48,6 +51,10 @@ def prediction_in(note: Mapping[str, Any] | None) -> ExecutionPrediction | None:
     """Return the prediction of an execution in the note of its trial, of whichever distance; None if there is none."""
     stored = (note or {}).get(PREDICTION)
     return ExecutionPrediction.from_json(stored) if isinstance(stored, dict) else None
+
+
+class SensitivityWarning(UserWarning):
+    """Closed loops on M are not smooth, so that the largest distance over the tasks is no stable number."""
 
 
 class CampaignDynamics:
@@ -69,6 +76,7 @@ class CampaignDynamics:
         self._store = store
         self.extra_recordings: Callable[[], Sequence[Trajectory]] = tuple
         self.failure: str | None = None
+        self.sensitivity: Sensitivity | None = None  #: of M, if its closed loops are not smooth
         self.shortage: TimeShortage | None = None  #: why the last verdict has no evidence; None if it has some
         self._use(DynamicsStudy(validation, seed))
         manual = bool(getattr(validation.system, "manual", False))
@@ -121,7 +129,22 @@ class CampaignDynamics:
     def note(self, trials: Sequence[Trial]) -> dict[str, Any]:
         """Return what the next trial stores of the thinking on its task; empty without a budget."""
         note = self.thinking.note(trials, self.ledger(trials) if trials else Ledger())
-        return {} if note is None else {THINKING: note}
+        found = {} if trials or self.sensitivity is None else {SENSITIVITY: self.sensitivity.to_json()}
+        return found if note is None else {THINKING: note, **found}
+
+    def find_sensitivity(self, threshold: float | None) -> None:
+        """Warn if small changes of M change distances as far as matters to a threshold; the first trial stores it.
+
+        Nothing is found without a budget of thinking, or if it does not suffice.
+        """
+        self.thinking.measure(())
+        thinking = self.thinking.after(())
+        if thinking is not None:
+            with contextlib.suppress(Exception):  # users' parts
+                self.sensitivity = found_sensitivity(self.study.planner, thinking, threshold)
+        if self.sensitivity is not None:
+            units = self.study.given.labels.units
+            warnings.warn(self.sensitivity.in_words(units), SensitivityWarning, stacklevel=2)
 
     def _allowed(self, trials: Sequence[Trial]) -> float:
         """Return the distance that is negligible beside all stated thresholds; 0 if executed ones are larger."""

@@ -7,7 +7,7 @@ import shlex
 import sys
 import webbrowser
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -23,12 +23,9 @@ from ctxval.cli import base
 from ctxval.cli.base import NewStore, Parallel, command, err, named_values, notes, out, print_table
 from ctxval.cli.config.settings import ExperimentSettings, read_settings
 from ctxval.cli.config.stored_settings import Limits
-from ctxval.cli.stores import print_envelope
 from ctxval.core.trajectory import Transitions
 from ctxval.core.trial import designs_sentence
 from ctxval.errors import CertificateError, InputError
-from ctxval.report import context_of_campaign, write_page
-from ctxval.web.jobs import ServedCampaign
 
 if TYPE_CHECKING:
     from ctxval.web.state import LiveCampaign
@@ -80,7 +77,7 @@ def run(
     if limit is not None:
         certificate.kind.require_usable(certificate.confidence, total)  # before executions are paid for
     _print_parts(experiment, limit)
-    with _live_page(live, ServedCampaign(experiment, campaign, limit, certificate, total), settings) as shown:
+    with _live_page((experiment, campaign, limit, certificate, total), settings) if live else nullcontext() as shown:
         with _pool(parallel, dask) as pool:
             campaign.run(
                 total,
@@ -107,6 +104,7 @@ def run(
         report |= {"budget": total, "units": experiment.units, **_summary(campaign, verdict, bound, known)}
         report |= {"store": str(path), "other_stores": [str(other.path) for other in other_stores(path)]}
         report |= {"options": settings.options} if settings.options else {}
+        report |= {} if campaign.sensitivity is None else {"sensitivity": campaign.sensitivity.to_json()}
         trusted = None
         if envelope and limit is not None:
             trusted = campaign.envelope(limit, certificate.confidence, certificate=certificate)
@@ -117,8 +115,13 @@ def run(
             # An earlier run may have written the same report.
             current = page.is_file() and campaign.store.computed(base.RUN) == {**result, "report": str(page)}
             try:
-                context = None if current else context_of_campaign(campaign, verdict, budget=total, envelope=trusted)
-                report["report"] = str(page if context is None else write_page(context, page))
+                if not current:
+                    from ctxval import report as reports  # imported here, because a finished campaign has one
+
+                    reports.write_page(
+                        reports.context_of_campaign(campaign, verdict, budget=total, envelope=trusted), page
+                    )
+                report["report"] = str(page)
             except Exception as error:  # it must not hide the verdict, for which executions were paid
                 err.say(f"no report: {reason_of(error)}")
                 report["report"] = None
@@ -175,6 +178,8 @@ def _print_result(
     if verdict is not None:
         base.print_verdict(verdict, report["units"])
     if trusted is not None:
+        from ctxval.cli.stores import print_envelope  # imported here, because it loads the reports
+
         print_envelope(trusted)
     if verdict is None and bound is not None:
         print_table({"certificate": bound.doubt or bound.statement})
@@ -211,11 +216,11 @@ def _pool(parallel: Parallel, dask: str | None) -> Iterator[dict[str, Any]]:
 
 
 @contextmanager
-def _live_page(wanted: bool, served: ServedCampaign, settings: ExperimentSettings) -> Iterator[LiveCampaign | None]:
-    if not wanted:
-        yield None
-        return
+def _live_page(parts: tuple[Any, ...], settings: ExperimentSettings) -> Iterator[LiveCampaign]:
     web, search = require_extra("ctxval.web.server", "web", "the page needs"), None
+    from ctxval.web.jobs import ServedCampaign  # imported here, because it loads the charts
+
+    served = ServedCampaign(*parts)
     if not settings.explores:
         ending = served.budget, served.threshold, settings.within
         search = IntervalSearch(served.campaign.recorder, served.certificate, *ending)

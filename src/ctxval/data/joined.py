@@ -1,4 +1,4 @@
-"""One recording in several tables, each with times of its own: ULog files of PX4, and CSV files, one for each topic."""
+"""One recording in several tables, each with times of its own: logs of PX4 and ArduPilot, and one CSV file a topic."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import io
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 
-from ctxval._util.columns import time_column
-from ctxval._util.files import open_regular
+from ctxval._util.columns import is_unit, time_column
+from ctxval._util.files import open_regular, require_regular_file
 from ctxval._util.refusals import require_extra
 from ctxval._util.texts import enumerated
 from ctxval.data.log import Clock, Log, MemoryTable, Signal, Table, reading
@@ -93,6 +93,46 @@ def read_ulog(path: Path) -> list[Log]:
         raise InputError(f"{path} has no message.")
     log = JoinedLog(str(path), tables, "us")
     log.about = [f"{path} is damaged: some of its messages are left out"] if content.file_corruption else []
+    return [log]
+
+
+def read_dataflash(path: Path) -> list[Log]:
+    """Return the recording in a DataFlash log of ArduPilot, a file ``.bin``; needs pymavlink.
+
+    A topic is a message such as ``ATT``, or ``IMU_0`` of the instance 0. Columns have the units that the log states.
+    """
+    kind = require_extra("pymavlink.DFReader", "logs", "logs of ArduPilot need").DFReader_binary
+    reader = kind.__new__(kind)  # apart from __init__, because a reader that fails keeps its file open
+    rows: dict[str, list[dict[str, float]]] = {}
+    units: dict[str, dict[str, str]] = {}
+    said = io.StringIO()
+    with reading(path, "a DataFlash log"), redirect_stdout(said), redirect_stderr(said):  # pymavlink prints warnings
+        require_regular_file(path)
+        try:
+            reader.__init__(str(path))
+            while (message := reader.recv_msg()) is not None:
+                about, content = message.fmt, message.to_dict()
+                if "TimeUS" in content:
+                    numbers = {name: value for name, value in content.items() if isinstance(value, int | float)}
+                    stated = {name: about.get_unit(name) for name in numbers}
+                    topic = about.name + (f"_{content[about.instance_field]}" if about.instance_field else "")
+                    rows.setdefault(topic, []).append(numbers)
+                    units[topic] = {name: unit for name, unit in stated.items() if unit and is_unit(unit)}
+        finally:
+            for opened in ("data_map", "filehandle"):
+                if hasattr(reader, opened):
+                    getattr(reader, opened).close()
+    tables = {}
+    for topic, messages in rows.items():
+        names = [name for name in messages[0] if name != "TimeUS"]
+        labels = {name: f"{name} [{units[topic][name]}]" if name in units[topic] else name for name in names}
+        columns = {"timestamp": np.array([each["TimeUS"] for each in messages], dtype=np.float64)}
+        columns |= {labels[name]: np.array([each.get(name, np.nan) for each in messages]) for name in names}
+        tables[topic] = MemoryTable(f"{path}, {topic}", columns)
+    if not tables:
+        raise InputError(f"{path} has no message with a time.")
+    log = JoinedLog(str(path), tables, "us")
+    log.about = [f"{path} is damaged: some of its messages are left out"] if said.getvalue() else []
     return [log]
 
 

@@ -194,8 +194,8 @@ class LogMapping(ShortRepr):
         """Return the mapping of a log whose fields have usual names.
 
         The states are ``states``, ``x`` or ``observation.state``, or the columns ``x0``, ``x1``, ...; the inputs are
-        ``inputs``, ``u`` or ``action``, or the columns ``u0``, ``u1``, ... The names in ``states`` and ``inputs``, with
-        their units, are looked for before these.
+        ``inputs``, ``u``, ``action`` or ``actions``, or the columns ``u0``, ``u1``, ... The names in ``states`` and
+        ``inputs``, with their units, are looked for before these.
         """
         columns, states, inputs = log.fields(), states or {}, inputs or {}
         wanted = {name: Field(name, unit) for name, unit in {**states, **inputs}.items()}
@@ -203,7 +203,7 @@ class LogMapping(ShortRepr):
             outputs = {name: wanted[name] for name in states if name not in inputs}
             return LogMapping(outputs, {name: wanted[name] for name in inputs}, dt=log.period)
         vectors = ("states", "x", "observation.state")
-        usual = _usual(columns, vectors, "x"), _usual(columns, ("inputs", "u", "action"), "u")
+        usual = _usual(columns, vectors, "x"), _usual(columns, ("inputs", "u", "action", "actions"), "u")
         if not usual[0]:
             how = "name the states and inputs with --state and --input of a command that has them, in a mapping, or in "
             how += "[states] and [inputs] of the experiment file"

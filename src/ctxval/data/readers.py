@@ -21,7 +21,8 @@ from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.files import MOST_BYTES, Archive, read_bytes, read_json, require_regular_file
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.tables import CsvTable
-from ctxval.data.joined import joined_topics, read_ulog
+from ctxval.data.hdf5 import read_hdf5
+from ctxval.data.joined import joined_topics, read_dataflash, read_ulog
 from ctxval.data.log import Log, MemoryTable, Table, leaves, reading
 from ctxval.data.matlab import read_mat
 from ctxval.data.messages import BagLog, McapLog
@@ -174,6 +175,8 @@ READERS: dict[str, Callable[[Path], list[Log]]] = {
     ".npz": read_npz,
     ".mat": read_mat,
     ".ulg": read_ulog,
+    ".bin": read_dataflash,
+    **dict.fromkeys((".hdf5", ".h5"), read_hdf5),
     ".parquet": read_parquet,
     ".mcap": lambda path: [McapLog(path)],
     ".db3": lambda path: [BagLog(path)],

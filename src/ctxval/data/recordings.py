@@ -137,8 +137,9 @@ def _clocked(log: Log, mapping: LogMapping) -> Clocked:
 
 def _clock(log: Log, mapping: LogMapping) -> Clock:
     """Return the clock of a mapping; rows of a table without times have equal steps."""
-    timed = mapping.clock.field is not None or not isinstance(log, Table) or time_column(log.source, log.fields())
-    return mapping.clock if timed else replace(mapping.clock, period=mapping.dt)
+    if mapping.clock.field is not None or not isinstance(log, Table) or time_column(log.source, log.fields()):
+        return mapping.clock
+    return replace(mapping.clock, period=log.period or mapping.dt)
 
 
 def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], notes: list[str]) -> list[Channel]:

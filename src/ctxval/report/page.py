@@ -97,7 +97,8 @@ def framed(
     A section that fails says why, and the others are shown; ``folded`` folds all but the first one.
     """
     assets = files("ctxval.report") / "assets"
-    style, script = ((assets / name).read_text("utf-8") for name in ("report.css", "report.js"))
+    charts, own, script = ((assets / name).read_text("utf-8") for name in ("charts.css", "report.css", "report.js"))
+    style = charts + own
     digests = (hashlib.sha256(asset.encode()).digest() for asset in (script, style))
     of_script, of_style = (base64.b64encode(digest).decode() for digest in digests)
     # Nothing but the style and the script of this page runs, and only data images are shown.

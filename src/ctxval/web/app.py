@@ -54,8 +54,7 @@ class PageRoutes:
         return [
             Route("/", self._start, methods=["GET"]),
             Route("/enter", self._enter, methods=["POST"]),
-            Mount("/static", StaticFiles(packages=[("ctxval.web", "static")])),
-            Route("/pictures/{name}.svg", self._inside(self._picture), methods=["GET"]),
+            Mount("/static", StaticFiles(packages=[("ctxval.web", "static"), ("ctxval.report", "assets")])),
             Route("/events", self._inside(self._events), methods=["GET"]),
         ]
 
@@ -115,14 +114,6 @@ class PageRoutes:
             all_="all" in request.query_params,
         )
         return HTMLResponse(page, 200 if problem is None else problem.status)
-
-    async def _picture(self, request: Request, session: str) -> Response:
-        picture = self.state.pictures.get(request.path_params["name"])
-        if not isinstance(picture, bytes):
-            return self._message("No picture", "There is no such picture yet.")
-        # A picture has styles of its own, and must not run anything if it is opened alone.
-        policy = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}
-        return Response(picture, media_type="image/svg+xml", headers=policy)
 
     async def _events(self, request: Request, session: str) -> Response:
         if self.state.listeners >= 64:

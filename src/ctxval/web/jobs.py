@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
@@ -18,17 +18,28 @@ from ctxval.campaign.by_hand import parameters_of_trial, write_files
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import OpenTrial
 from ctxval.campaign.interval_search import require_decisive
-from ctxval.campaign.plot import overview, worst_trajectories
 from ctxval.certificates import CertificateOptions, Verdict
 from ctxval.certificates import judge as judge_trials
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of
 from ctxval.core.trial import Trials
 from ctxval.errors import InputError
+from ctxval.report import Axis, Chart, ReportContext, paragraph
+from ctxval.report.charts import small_charts
+from ctxval.report.sections.distances import over_tasks
+from ctxval.report.sections.trials import signals_of
 
 Files = dict[str, bytes]  #: the files of a trial by name
 
-Pictures = dict[str, bytes | str]  #: pictures by name as SVG; a text says why a picture is missing
+Pictures = dict[str, str]  #: pictures by name, as HTML
+
+
+class Interval(NamedTuple):
+    """What is known of the largest distance after some executions; the bound is None if there is none."""
+
+    executions: int
+    low: float
+    high: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,22 +177,43 @@ def draw(served: ServedCampaign) -> Pictures:
 
 
 def pictures_of(served: ServedCampaign) -> Pictures:
-    import matplotlib
-    from matplotlib.figure import Figure
+    campaign, tau = served.campaign, served.threshold
+    context = ReportContext(
+        campaign.name,
+        campaign.validation.space,
+        campaign.trials,
+        campaign.store,
+        None if tau is None else Verdict("undecided", tau, ""),
+        labels=campaign.validation.labels,
+    )
+
+    def of_worst() -> Markup | None:
+        worst = context.worst_tasks(1, recorded=True)
+        return small_charts(signals_of(context, worst[0].number)) if worst else None
 
     pictures: Pictures = {}
-    for name in ("distance", "worst") if served.campaign.worst else ():
-        # Names of parameters may contain a $, which is not mathematics; a stated id makes equal pictures equal files.
+    for name, drawing in {"tasks": lambda: over_tasks(context), "worst": of_worst}.items():
         try:
-            with matplotlib.rc_context({"text.parse_math": False, "svg.hashsalt": "ctxval"}):
-                if name == "worst":
-                    figure = worst_trajectories(served.campaign)
-                else:
-                    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-                    overview(served.campaign, threshold=served.threshold, ax=figure.add_subplot())
-                content = io.BytesIO()
-                figure.savefig(content, format="svg", metadata={"Date": None})
-            pictures[name] = content.getvalue()
+            drawn = drawing()
         except Exception as error:  # a picture must not hide the verdict
-            pictures[name] = reason_of(error)
+            drawn = paragraph(f"There is no picture: {reason_of(error)}.")
+        if drawn is not None:
+            pictures[name] = str(Markup(drawn))
     return pictures
+
+
+def interval_chart(history: Sequence[Interval], threshold: float | None, units: str) -> Markup:
+    """Return how the interval of the largest distance closes, with the executions; empty with fewer than two."""
+    known = [each for each in history if np.isfinite(each.low)]
+    if len(known) < 2:
+        return Markup()
+    counts, low = np.array([each.executions for each in known]), np.array([each.low for each in known])
+    high = np.array([np.nan if each.high is None else each.high for each in known])
+    most = 3 * max(low.max(), threshold or 0.0)
+    label = f"largest distance [{units}]" if units else "largest distance"
+    near = threshold if threshold is not None and threshold <= 3 * np.nanmax([*low, *high]) else 0.0
+    y = Axis.over(label, low, np.minimum(high, most), near, zero=True)
+    chart = Chart("The interval of the largest distance", Axis("executions", counts[0], counts[-1], whole=True), y)
+    chart.line(counts, np.minimum(high, 1.02 * y.high), "bound", "bound on it")
+    chart.line(np.repeat(counts, 2)[1:], np.repeat(low, 2)[:-1], "best", "executed")
+    return chart.limit(threshold, "threshold", "threshold").render()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import secrets
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup
 
 from ctxval._util.representation import counted, line, number
 from ctxval._util.texts import shortened, visible
@@ -18,7 +18,7 @@ from ctxval.campaign.dynamics import prediction_in
 from ctxval.certificates.bounds import with_error
 from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trial import Trial
-from ctxval.web.jobs import Files
+from ctxval.web.jobs import Files, interval_chart
 from ctxval.web.security import MOST_UPLOAD
 from ctxval.web.state import PageState
 
@@ -67,7 +67,6 @@ class Page:
     ) -> str:
         state, snapshot, space = self._state, self._state.snapshot, self._space
         certificate = state.certificate if state.verdict is None else state.verdict.certificate
-        images = {name: data for name, data in state.pictures.items() if isinstance(data, bytes)}
         shown = snapshot.trials if all_ else snapshot.trials[-200:]  # a link shows all
         return self.render(
             "campaign.html",
@@ -87,7 +86,8 @@ class Page:
             problem=problem,
             given=lambda where, field: problem.fields.get(field, "") if problem and problem.where == where else "",
             token=form_token,
-            pictures={name: f"{zlib.crc32(data):08x}" for name, data in images.items()},
+            pictures={name: Markup(drawn) for name, drawn in state.pictures.items()},
+            closing=interval_chart(state.history, self._served.threshold, self._units),
             most=MOST_UPLOAD,
             submission=lambda: secrets.token_urlsafe(12),
         )

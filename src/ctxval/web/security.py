@@ -24,8 +24,8 @@ from ctxval.errors import InputError
 MOST_UPLOAD = 64 * 2**20  #: largest size of a recording in bytes
 
 HEADERS = {
-    # Nothing from elsewhere, and no script or style inside the page.
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+    # Nothing from elsewhere, and no script or style inside the page; maps are images inside of charts.
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
     "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",

@@ -23,7 +23,7 @@ from ctxval.campaign.telling import SuppliedResult
 from ctxval.core.trial import Trial
 from ctxval.errors import CampaignError, CtxvalError, DistanceError, InputError
 from ctxval.web import jobs
-from ctxval.web.jobs import Files, OpenCampaign, ServedCampaign, TaskRequest
+from ctxval.web.jobs import Files, Interval, OpenCampaign, ServedCampaign, TaskRequest
 from ctxval.web.state import Innermost, PageState, Work
 
 Result = TypeVar("Result")
@@ -194,7 +194,10 @@ class CampaignService(PageState):
             except CtxvalError as error:
                 self.update(judged=ended, verdict=None, judgement_error=str(error))
             else:
-                self.update(judged=ended, verdict=verdict, judgement_error=None)
+                worst, bound = self.snapshot.trials.worst, None if verdict is None else verdict.bound
+                known = [] if worst is None else [Interval(self.snapshot.trials.executions, worst.least, bound)]
+                history = (*self.history, *known)
+                self.update(judged=ended, verdict=verdict, judgement_error=None, history=history)
         self.update(judging=None)
 
 

@@ -19,7 +19,7 @@ from ctxval._util.progress import Listener, Progress, amount
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.certificates import Certificate, Verdict
 from ctxval.core.trial import Trial
-from ctxval.web.jobs import Files, Pictures, ServedCampaign, Snapshot, pictures_of
+from ctxval.web.jobs import Files, Interval, Pictures, ServedCampaign, Snapshot, pictures_of
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,7 @@ class PageState:
     def __init__(self, served: ServedCampaign, snapshot: Snapshot) -> None:
         self.served, self.snapshot = served, snapshot
         self.pictures: Pictures = {}
+        self.history: tuple[Interval, ...] = ()  # how the interval of the largest distance closed, since the start
         self.files: dict[int, Files | str] = {}  # of open trials; a text says why there are none
         self.input_differences: dict[int, str | None] = {}  # of the recordings that were told here
         self.version = time.time_ns()  # which grows with each change, also when the server is started again
@@ -185,6 +186,7 @@ class LiveCampaign(PageState):
             low, high = self._search.interval
             bound = "not known yet" if high is None else f"{high:.4g}"
             changes["interval"] = f"from {low:.4g} to {bound} {self.served.experiment.units}".rstrip()
+            changes["history"] = self.history = (*self.history, Interval(self.served.campaign.executions, low, high))
         begun = time.monotonic()
         if begun - self._drawn >= 10 * self._cost:  # pictures take at most about a tenth of the time
             changes["pictures"] = pictures_of(self.served)

@@ -349,6 +349,8 @@ def _not_selected(known: Provenance, count: int, tau: float) -> list[str]:
     if not others:
         return [*sentences, alone]
     lie = "store of this experiment lies" if others == 1 else "stores of this experiment lie"
+    if all(other.worst is None for other in known.beside):
+        return [*sentences, f"{alone} ({others} other {lie} beside it)"]
     which = "none of them falsifies the threshold" if others > 1 else "it does not falsify the threshold"
     falsifying = [quoted(other.path.name) for other in known.beside if other.falsifies(tau)]
     if falsifying:

@@ -22,7 +22,10 @@ from ctxval.core.plan import Plan, require_repeatable
 from ctxval.core.soundness import MISSED, SATURATED, goal_misses
 from ctxval.core.trajectory import COMPLETE
 from ctxval.errors import ConformanceError, CtxvalError
+from ctxval.learning import DynamicsStudy
 from ctxval.learning.extended import with_states_of_model
+from ctxval.learning.sensitivity import found_sensitivity
+from ctxval.learning.stage_costs import Speed, Thinking, ThinkingSettings
 from ctxval.models import MuJoCo
 from ctxval.models.mujoco import proposed_invariant
 from ctxval.specs import Specification
@@ -62,6 +65,7 @@ def check_experiment(
             "system": _system(validation, plans[0], counts),
             "model": _model(validation, of_model),
             "model against itself": _itself(validation, plans),
+            "small changes": _small_changes(validation),
             "batches": _batches(validation, plans),
             "distance": _distance(experiment, plans),
             "specification": _specification(spec, plans),
@@ -188,6 +192,17 @@ def _model(validation: Validation, counts: Mapping[str, int]) -> Findings:
         proposed = list(proposed_invariant(model.compiled))
         if proposed:
             yield "noted", f"if the ground of S is flat, invariant = {proposed} lets fewer executions teach M's error"
+
+
+def _small_changes(validation: Validation) -> Findings:
+    """State how far small changes move closed loops of M, if these are not smooth."""
+    study, settings = DynamicsStudy(validation), ThinkingSettings()
+    points = validation.space.unit_draws(16, np.random.default_rng(0)) if validation.space.members is None else None
+    speed = None if points is None else Speed.measured(study.validation, points, settings)
+    if speed is not None:
+        found = found_sensitivity(study.planner, Thinking(settings.default, settings.default, speed))
+        if found is not None:
+            yield "noted", found.in_words(validation.labels.units)
 
 
 def _itself(validation: Validation, plans: Sequence[Plan]) -> Findings:

@@ -32,7 +32,6 @@ from ctxval.distances import UnsafeMargin
 from ctxval.errors import CertificateError, InputError, UnknownNameError
 from ctxval.models import Refined, read_refined
 from ctxval.studies.aspect1 import TASKS
-from ctxval.studies.safety import judged_by
 
 Part = dict[str, Any]  #: a table with a type, which may be ``module:attr``, and its arguments
 
@@ -113,6 +112,8 @@ class SpecTable(BaseModel, extra="allow"):
 
     def on(self, experiment: Experiment) -> Experiment:
         """Return an experiment that judges the specification in place of its distance; the threshold is the margin."""
+        from ctxval.studies.safety import judged_by  # imported here, because few files have a specification
+
         return judged_by(experiment, UnsafeMargin({"type": self.type, **(self.model_extra or {})}, margin=self.margin))
 
 

@@ -53,7 +53,7 @@ def trials(context: ReportContext) -> Markup:
     drawn = [heading(f"The {counted(len(worst), 'worst task')}")]
     for trial in worst:
         head = f"Trial {trial.number}: {quantity(trial.distance, context.labels.units)} at {task_of(context, trial)}"
-        drawn.append(details(head, small_charts(_signals(context, trial.number)), opened=trial is worst[0]))
+        drawn.append(details(head, small_charts(signals_of(context, trial.number)), opened=trial is worst[0]))
     without = paragraph("No trajectories are recorded, so the worst tasks cannot be drawn.")
     parts = [paragraph(" ".join(notes))] if notes else []
     parts += [
@@ -83,7 +83,7 @@ def task_of(context: ReportContext, trial: Trial) -> str:
     return ", ".join(listed[:4]) + (f" and {len(listed) - 4} more" if len(listed) > 4 else "")
 
 
-def _signals(context: ReportContext, trial: int) -> list[Chart]:
+def signals_of(context: ReportContext, trial: int) -> list[Chart]:
     """Return one chart for each state and input of a trial, those with the largest errors if they are many."""
     pair, replay = context.recordings[trial], context.replays.get(trial)
     corrected = None if replay is None else replay.corrected

@@ -99,8 +99,10 @@ def _facts(context: ReportContext) -> Markup:
     if certificate is not None:
         how = "withdrawn" if certificate.doubt is not None else f"{percent(certificate.confidence)} confidence"
         bound = f"{with_error(certificate.upper_bound, certificate.error)} {units}".rstrip()
-        rows.append(("Bound on all tasks", f"{bound} ({certificate.kind}, {how})"))
-        if certificate.volume:
+        share = certificate.details.get("share")
+        tasks = "all tasks" if share is None else f"{100 * share:.4g} % of the tasks"
+        rows.append((f"Bound on {tasks}", f"{bound} ({certificate.kind}, {how})"))
+        if certificate.volume and share is None:
             rows.append(("Tasks left out", f"{at_most(100 * certificate.volume, 3)} %"))
     if verdict is not None:
         rows.append(("Threshold", quantity(verdict.threshold, units)))

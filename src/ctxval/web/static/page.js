@@ -34,6 +34,7 @@ function replace(old, fresh) {
   const open = [...old.querySelectorAll("details")].map((details) => details.open);
   const focused = old.contains(document.activeElement) ? document.activeElement : null;
   const place = focused ? [...old.querySelectorAll("a, button, summary, [tabindex]")].indexOf(focused) : -1;
+  old.hidden = fresh.hidden;
   old.replaceChildren(...fresh.childNodes);
   old.querySelectorAll("details").forEach((details, k) => { if (open[k]) details.open = true; });
   if (place >= 0) {
