@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctxval import Campaign, Task, TaskSuite
+from ctxval import Campaign, Task, TaskSuite, Validation, distances, load_experiment, searches, systems
 from ctxval.core.controller import started
+from ctxval.models import read_model
+from rig_cli import calling
 from shared_data import shared_data
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -105,3 +107,67 @@ def test_two_repeats_against_the_published_models() -> None:
         suite = TaskSuite({name: {"number": number} for number, name in enumerate(repeats)})
         campaign = Campaign(whole.with_parts(space=suite)).run(2, 0.1)
         assert campaign.verdict(0.1).answer == answer
+
+
+def saved(path: Path, fields: dict[str, np.ndarray], seconds: float) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, **{name: values[fields["t"] <= seconds] for name, values in fields.items()})
+
+
+def as_hints_say(file: Path, folder: Path) -> None:
+    """Edit the experiment file of ``ctxval start``: its recordings are the system, the tasks and the controllers."""
+    lines, kept = file.read_text().splitlines(), True
+    text = []
+    for line in lines:
+        if line.startswith("["):
+            kept = line not in ("[space]", "[task]", "[synthesizer]", "[system]")
+        table = line.removeprefix("# ")
+        if line != table and table.split(" = ")[0] in ("[system]", "type", "runs", "mapping"):
+            text.append(table.replace("FOLDER", str(folder)))
+        elif kept and not line.startswith("#"):
+            text.append(line)
+    parts = [f'{name} = {{ type = "recorded" }}' for name in ("task", "synthesizer")]
+    first = next(k for k, line in enumerate(text) if line.startswith("["))
+    file.write_text("\n".join([*text[:first], *parts, *text[first:]]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["so101", "double_pendulum"])
+@pytest.mark.usefixtures("without_costs")
+def test_python_and_files_of_start_conclude_the_same(robot: str, tmp_path: Path) -> None:
+    data, logs = shared_data(robot), tmp_path / "logs"
+    if robot == "so101":
+        for name in ("multisine", "slow_precision"):
+            file = np.load(data / f"{name}.npz")
+            saved(logs / f"{name}.npz", {field: file[field] for field in ("t", "command", "position")}, 8.0)
+    else:
+        for condition in (double_pendulum.UNDISTURBED, double_pendulum.PERTURBED):
+            file = np.load(data / f"{condition}.npz")
+            for k in ("00", "01"):
+                fields = {name: file[f"{name}_{k}"] for name in ("t", "position", "velocity", "torque_command")}
+                saved(logs / condition / f"repeat{k}.npz", fields, 0.4)
+    started_with = calling()("start", *map(str, sorted(logs.rglob("*.npz"))), "--out", str(tmp_path / "start"))
+    assert started_with.exit_code == 0, started_with.output
+    as_hints_say(tmp_path / "start" / "experiment.toml", logs)
+    of_file = load_experiment(tmp_path / "start" / "experiment.toml").validation
+
+    recorded = systems.Recorded(logs, tmp_path / "start" / "mapping.toml")
+    of_python = Validation(
+        space=TaskSuite(recorded.names, repeats=recorded.repeats),
+        task=recorded.task,
+        system=recorded,
+        model=read_model(tmp_path / "start" / "model.npz"),
+        synthesizer=recorded,
+        distance=distances.MaximumDeviation(components=(0,)),
+        start_tolerance=of_file.start_tolerance,
+    )
+    assert recorded.repeats == (1 if robot == "so101" else 2)
+    found = []
+    for validation in (of_file, of_python):
+        campaign = Campaign(validation, search=searches.by_name("random"), seed=0).run(4, 1e3)
+        largest = max(trial.distance or 0.0 for trial in campaign.trials)
+        answers = [campaign.verdict(share * largest).answer for share in (0.9, 1.1)]
+        found.append(([(trial.parameters, trial.distance) for trial in campaign.trials], answers))
+    assert found[0] == found[1]
+    # Two repeats of a task show nothing of 90 % of its executions.
+    assert found[0][1] == (["falsified", "validated"] if robot == "so101" else ["undecided", "undecided"])

@@ -73,7 +73,8 @@ def test_draws_run_together_as_alone(model: Model, n: int, m: int) -> None:
     for candidate in dictionary(model, n, m):
         require_equal_draws(model, (candidate.effect.with_sizes(drawn(candidate, rng)),), n, m)
         seen.add(type(candidate.effect).__name__)
-    fixed = {"ObservationDelay", "WrappedAngle", "Effect", "JointStop"}  # sizes that are counted; and nothing stops
+    fixed = {"ObservationDelay", "WrappedAngle", "Effect"}  # sizes that are counted
+    fixed |= {"JointStop", "RunOffset"}  # nothing stops, and there is one run
     # A constant force on a driven joint is an offset of its input.
     of_mujoco = {"JointAttribute", "BodyMass", "MassCentre"}
     assert m == 1 or seen == {kind.__name__ for kind in kinds()} - fixed - of_mujoco - {"Bias"}

@@ -15,6 +15,7 @@ from ctxval import (
     Labels,
     Task,
     TaskSpace,
+    Trajectory,
     Validation,
     controllers,
     distances,
@@ -22,6 +23,7 @@ from ctxval import (
     searches,
     systems,
 )
+from ctxval.core.controller import Controller
 from ctxval.core.model import Step
 from ctxval.errors import InputError
 from ctxval.studies import causes
@@ -96,6 +98,27 @@ def test_a_stop_and_friction_by_direction_are_found() -> None:
     assert (type(friction), friction.sizes) == (causes.DirectedFriction, pytest.approx((0.6, 0.2), rel=0.02))
 
 
+def test_an_offset_of_each_execution_is_estimated() -> None:
+    class Drifting(systems.Imperfect):
+        offsets = iter((0.3, -0.2, 0.1))
+
+        def execute(self, controller: Controller, task: Task) -> Trajectory:
+            offset, carriage = next(self.offsets), slide(no_force)
+            moved = systems.Imperfect(lambda x, u: carriage(x, u + offset), vectorized=True)
+            return moved.execute(controller, task)
+
+    given = campaign(slide(no_force)).validation
+    changed = given.with_parts(system=Drifting(slide(no_force), vectorized=True))
+    report = find_causes(Campaign(changed, search=searches.by_name("random"), seed=0).run(3))
+    (offset,) = report.causes
+    assert type(offset) is causes.RunOffset
+    # The executions are in the order of their distances.
+    assert sorted(offset.sizes) == pytest.approx([-0.2, 0.1, 0.3], abs=1e-3)
+    model = eval(offset.python(), {"causes": causes})
+    assert model == offset.with_sizes([float(f"{size:.6g}") for size in offset.sizes])
+
+
+@pytest.mark.slow
 def test_noise_does_not_hide_a_weak_motor() -> None:
     weak = slide(no_force)
     report = found(lambda x, u: weak(x, 0.8 * u), measurement=[1e-3, 2e-3])

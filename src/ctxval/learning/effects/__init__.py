@@ -11,6 +11,7 @@ from ctxval.learning.effects.joint_stop import JointStop
 from ctxval.learning.effects.model import ModelWithEffects
 from ctxval.learning.effects.mujoco import BodyMass, JointAttribute, MassCentre
 from ctxval.learning.effects.plant import Joint
+from ctxval.learning.effects.run_offset import RunOffset
 from ctxval.learning.effects.saturation import RateLimit, Saturation
 from ctxval.learning.effects.sensor import SensorOffset, SensorScale, SwappedJoints, WrappedAngle
 from ctxval.learning.effects.time_step import TimeStep
@@ -43,6 +44,7 @@ __all__ = [
     "Parameter",
     "RateLimit",
     "ReversedInput",
+    "RunOffset",
     "Saturation",
     "SensorOffset",
     "SensorScale",

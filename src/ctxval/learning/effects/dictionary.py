@@ -26,7 +26,7 @@ def kinds() -> list[type[Effect]]:
 
 
 def candidates(
-    plant: Plant, x: Array, u: Array, residuals: Array, *, seconds: float, estimated: bool = False
+    plant: Plant, x: Array, u: Array, residuals: Array, *, seconds: float, estimated: bool = False, runs: int = 1
 ) -> tuple[EffectCandidate, ...]:
     """Return the effects that a plant may have, from transitions of executions.
 
@@ -37,7 +37,8 @@ def candidates(
         residuals: what M misses of the next states, shape ``(N, n)``.
         seconds: the length of the longest execution.
         estimated: whether states are estimated from outputs.
+        runs: the number of executions, which may have offsets of their own.
     """
     missed = np.sqrt([(column**2).mean() for column in residuals.T])
-    observed = Observed(plant, x, u, missed, seconds, estimated)
+    observed = Observed(plant, x, u, missed, seconds, estimated, runs)
     return tuple(candidate for kind in kinds() for candidate in kind.candidates(observed))

@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
@@ -95,6 +95,10 @@ class Effect(ShortRepr):
         """Return the flow of a step for the flow without this effect."""
         return flow
 
+    def in_run(self, run: int | Rows) -> Effect:
+        """Return the effect in one execution, or for rows ``(N,)`` that belong to executions, by their numbers."""
+        return self
+
     def allowed(self, x: Array) -> Array:
         """Return the states ``(..., n)`` that the mechanics end a step in, for those without this effect."""
         return x
@@ -172,6 +176,7 @@ class Observed(ShortRepr):
     missed: Array  #: root mean squares of the residuals of M ``(n,)``
     seconds: float  #: of the longest execution
     estimated: bool  #: whether states are estimated from outputs, so that they have no sensors
+    runs: int = 1  #: the number of executions
 
     @functools.cached_property
     def forces(self) -> tuple[tuple[Joint, float, float], ...]:

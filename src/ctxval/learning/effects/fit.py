@@ -38,6 +38,7 @@ class Predictions(ShortRepr):
     steps: int
     states: Rows  #: rows of the first state and, in all padded runs, of the first input, ``(N,)``
     inputs: Rows
+    runs: Rows  #: the numbers of the executions ``(N,)``
     floors: Array  #: residuals ``(n,)`` that are too small to be evidence
 
 
@@ -56,7 +57,9 @@ class Segments:
         most: tuple[int, int] = (600, 120),
         settings: SegmentSettings = SegmentSettings(),
         known: tuple[Effect, ...] = (),
+        numbers: Sequence[int] | None = None,
     ) -> None:
+        self.numbers: Rows = np.array(range(len(runs)) if numbers is None else numbers)  # of the executions
         self.settings, self._geometry = settings, geometry_of(model)
         self.model, self.known, self.horizons = model, known, [len(run.inputs) for run in runs]
         self.states = np.concatenate([run.states for run in runs])
@@ -75,15 +78,16 @@ class Segments:
             self.sizes.append(np.maximum(_size(left), self.windows[-1].floors))
 
     def _window(self, steps: int, most: int) -> Predictions:
-        states, inputs, first = [], [], 0
+        states, inputs, runs, first = [], [], [], 0
         for number, horizon in enumerate(self.horizons):
             begins = np.arange(0, horizon - steps + 1, max(1, steps // 2))
             states.append(first + begins)
             inputs.append(number * self.inputs.shape[1] + begins)
+            runs.append(np.full(len(begins), self.numbers[number]))
             first += horizon + 1
-        of_states, of_inputs = np.concatenate(states), np.concatenate(inputs)
+        of_states, of_inputs, of_runs = map(np.concatenate, (states, inputs, runs))
         rows = np.linspace(0, len(of_states) - 1, min(len(of_states), most)).round().astype(np.intp)
-        return Predictions(steps, of_states[rows], of_inputs[rows], np.zeros(self.states.shape[1]))
+        return Predictions(steps, of_states[rows], of_inputs[rows], of_runs[rows], np.zeros(self.states.shape[1]))
 
     @property
     def pairs(self) -> tuple[Array, Array, Array]:
@@ -107,7 +111,8 @@ class Segments:
         Predictions begin at recorded states that are moved.
         """
         draws = (repaired.draws,) if repaired.draws else ()
-        acting = repaired.acting(np.broadcast_to(self.inputs, (*draws, *self.inputs.shape)))
+        acting = repaired.in_run(self.numbers).acting(np.broadcast_to(self.inputs, (*draws, *self.inputs.shape)))
+        repaired = repaired.in_run(window.runs)
         acting = acting.reshape(*draws, -1, *acting.shape[len(draws) + 2 :])
         begun = self._geometry.add(self.states[window.states], np.zeros(self.states.shape[1]) + moved)
         x = repaired.true(np.broadcast_to(begun, (*draws, *begun.shape)))
@@ -128,7 +133,8 @@ class Segments:
         # The noise of a measurement enters two successive residuals, with opposite signs.
         runs = np.split(left, np.cumsum(self.horizons)[:-1])
         products = np.concatenate([run[1:] * run[:-1] for run in runs])
-        window = replace(self.windows[0], states=self.windows[0].states[::4], inputs=self.windows[0].inputs[::4])
+        first = self.windows[0]
+        window = replace(first, states=first.states[::4], inputs=first.inputs[::4], runs=first.runs[::4])
         here, slopes = self.left_by(repaired, window), np.ones(left.shape[1])
         for i, size in enumerate(0.1 * self.sizes[0]):
             there = self.left_by(repaired, window, size * np.eye(len(slopes))[i])

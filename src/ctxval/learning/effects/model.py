@@ -61,6 +61,12 @@ class ModelWithEffects(ShortRepr):
         few = tuple(each.with_sizes(some) for each, some in zip(self.effects, sizes, strict=True))
         return replace(self, given=self.given[rows] if isinstance(self.given, Draws) else self.given, effects=few)
 
+    def in_run(self, run: int | Rows) -> ModelWithEffects:
+        """Return the model in one execution, or for rows that belong to executions; see :meth:`Effect.in_run`."""
+        if all(type(each).in_run is Effect.in_run for each in self.effects):
+            return self
+        return replace(self, effects=tuple(each.in_run(run) for each in self.effects))
+
     @functools.cached_property
     def _one_by_one(self) -> tuple[ModelWithEffects, ...]:
         """The draws, with numbers as sizes, if they have models of MuJoCo of their own; empty otherwise."""

@@ -95,7 +95,10 @@ class ClosedLoops:
 
     def distance_from_tasks(self, repaired: ModelWithEffects) -> float | None:
         """Return the largest distance of executions from loops that begin where tasks begin; None if a loop fails."""
-        loops = ((each, self.of_plan(repaired, each.plan, each.executed.horizon)) for each in self.executions)
+        loops = (
+            (each, self.of_plan(repaired.in_run(k), each.plan, each.executed.horizon))
+            for k, each in enumerate(self.executions)
+        )
         largest = max(np.inf if loop is None else self._distance(each, loop) for each, loop in loops)
         return largest if np.isfinite(largest) else None
 
@@ -217,8 +220,11 @@ class _Study:
         self.segments = Segments(self.model, runs, settings=taken, known=known)
         floors = [window.floors for window in self.segments.windows]
         self.some = Segments(self.model, runs, floors, (200, 40), taken, known)  # all causes are screened on these
-        without = (runs[:k] + runs[k + 1 :] for k in range(len(runs)))
-        self.others = [Segments(self.model, rest, floors, settings=taken, known=known) for rest in without]
+        numbers = range(len(runs))
+        self.others = [
+            Segments(self.model, [runs[k] for k in rest], floors, settings=taken, known=known, numbers=rest)
+            for rest in ([k for k in numbers if k != out] for out in numbers)
+        ]
         x, u, residuals = self.segments.pairs
         usable = np.isfinite(residuals).all(axis=1)
         if not usable.any():
@@ -230,7 +236,8 @@ class _Study:
             self.known = (*self.known, *seen_stops(self.plant.joints, states, following, self.plant.dt))
         seconds = max(run.horizon for run in runs) * self.plant.dt
         records = x[usable], u[usable], residuals[usable]
-        self.dictionary = candidates(self.plant, *records, seconds=seconds, estimated=self.outputs)
+        estimated, count = self.outputs, len(runs)
+        self.dictionary = candidates(self.plant, *records, seconds=seconds, estimated=estimated, runs=count)
         self.loops = ClosedLoops(validation, executions)
         self.before = max(self.loops.distances)
 
@@ -248,7 +255,8 @@ class _Study:
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
             while chosen is not None and chosen.counts(self.before) and len(self._fitted(chosen)) < most:
-                if chosen.explanation.left < 0.02 or chosen.complete > 0.99:  # nothing is left for another cause
+                is_small = chosen.explanation.left < 0.02 and chosen.complete >= self.settings.named
+                if is_small or chosen.complete > 0.99:  # nothing is left for another cause
                     break
                 better, others = self._chosen(self._ranked(self._fitted(chosen)))
                 if better is not None:  # the first one was chosen without the other ones
@@ -313,11 +321,30 @@ class _Study:
         # What comes to less than a quarter of the evidence of the best one is not worth a fit.
         worth = [result for result in results[: self.settings.fitted] if result[0] <= 0.25 * results[0][0]]
         refined = [explained(self.segments, together, begun) for _, begun, together in worth or results[:1]]
+        refined += [
+            explained(self.segments, (*self.known, *beside, each), screened(self.some, (*self.known, *beside, each))[1])
+            for each in self._simpler(min(refined, key=lambda each: each.criterion))
+        ]
         distinct = list[Explanation]()
         for explanation in sorted(refined, key=lambda each: each.criterion):
             if not any(_is_same(explanation, other) for other in distinct):
                 distinct.append(explanation)
         return distinct
+
+    def _simpler(self, explanation: Explanation) -> list[EffectCandidate]:
+        """Return causes of the same joint with fewer sizes, if a size of the last cause of an explanation is 0."""
+        last = explanation.candidates[-1]
+        sizes = zip(last.effect.sizes, last.parameters, strict=True)
+        if len(last.parameters) < 2 or not any(abs(float(size)) < 0.01 * p.scale for size, p in sizes):
+            return []
+        joint = getattr(last.effect, "joint", None)
+        return [
+            each
+            for each in self.dictionary
+            if len(each.parameters) < len(last.parameters)
+            and getattr(each.effect, "joint", joint) == joint
+            and isinstance(each.effect, Force)
+        ]
 
     def _chosen(self, ranked: list[Explanation]) -> tuple[Explained | None, list[Explained]]:
         """Return the most probable explanation that counts, and those that the executions do not tell from it.
@@ -352,10 +379,10 @@ class _Study:
         """Return how well causes predict each execution if they are fitted to the others."""
         noise = np.zeros(self.segments.states.shape[1]) if self.outputs else self.segments.noise(explanation.repaired)
         predicted, sizes = list[Predicted](), []
-        for execution, others in zip(self.executions, self.others, strict=True):
+        for k, (execution, others) in enumerate(zip(self.executions, self.others, strict=True)):
             fitted = explained(others, explanation.candidates, explanation.sizes, near=True)
             sizes.append(fitted.sizes)
-            predicted.append(self.loops.predicted(fitted.repaired, execution, noise))
+            predicted.append(self.loops.predicted(fitted.repaired.in_run(k), execution, noise))
         by_noise = float(np.sum([each.by_noise.mean() for each in predicted]))
         spread = float(np.sqrt(np.sum([each.by_noise.var() for each in predicted])))
         left = float(np.sum([each.deviation for each in predicted])) - by_noise
