@@ -105,6 +105,8 @@ def test_independent_draws_above_the_threshold_raise_what_tests_alone_say() -> N
     tests = certify_dynamics(sample, replace(GOOD, share=SHARE, threshold=1.2)).details["tests"]
     none = certify_dynamics(replace(sample, distances=np.full(30, 0.5)), replace(GOOD, share=SHARE, threshold=1.2))
     assert tests["above"] == 1
+    chosen = certify_dynamics(replace(sample, origins=["covering"] * 30), replace(GOOD, share=SHARE, threshold=1.2))
+    assert chosen.details["tests"]["share_missed"] is None
     assert tests["share_missed"] > none.details["tests"]["share_missed"]
 
 

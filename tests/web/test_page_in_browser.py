@@ -113,6 +113,7 @@ def test_a_whole_campaign_by_hand_of_two_operators(browser: Any, folder: Path, a
     second = Operator(browser, folder, address, accept_downloads=True)
     number = first.opened()
     assert number == 0
+    assert first.page.locator("button:visible").all_inner_texts() == ["Check and store the recording"]
     recording = record(first.files(number), folder / "run.csv")
     second.opened()
     loses_and_doubles_nothing(first, second, recording)

@@ -196,11 +196,12 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
         doubt=doubt,
         withdrawn_by=None if doubt is None else withdrawn_by,
         error=error,
-        volume=1 - evidence.share,
+        volume=round(1 - evidence.share, 12),
     )
 
 
-def _tests_alone(sample: Sample, level: float, confidence: float) -> dict[str, float | int]:
+def _tests_alone(sample: Sample, level: float, confidence: float) -> dict[str, float | None]:
     """Return which share of the tasks exceeds a level at most, by all independent draws, and how many of these do."""
     above = ~(sample.only("iid").distances <= level)
-    return {"share_missed": anytime_volume(above, 1 - confidence), "above": int(above.sum())}
+    missed = anytime_volume(above, 1 - confidence) if len(above) else None
+    return {"share_missed": missed, "above": int(above.sum())}

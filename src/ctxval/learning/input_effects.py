@@ -89,10 +89,15 @@ def found_effects(
         if longer is None:
             break
         best, mode = longer
-        for each in best if len(best) > 1 else ():  # one may explain alone what two explain in part
-            shorter, of_shorter = search.refined(tuple(other for other in best if other is not each))
+        for each in best if len(best) > 1 else ():  # one may explain alone, or with another one, what two explain
+            others = tuple(other for other in best if other is not each)
+            shorter, of_shorter = search.refined(others)
             if of_shorter.height > mode.height - needed:
                 best, mode = shorter, of_shorter
+                break
+            exchanged = search.longer(shorter, of_shorter, mode.height - of_shorter.height + 1.0)
+            if exchanged is not None:
+                best, mode = exchanged
                 break
     return best
 

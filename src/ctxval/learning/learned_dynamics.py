@@ -166,8 +166,14 @@ class LearnedDynamics(ShortRepr):
         """The same of each state ``(n,)``; 0 for those of which nothing is learned."""
         numbers = range(len(self.executed))
         without = self.posterior.means_without([[k] for k in numbers])
-        errors = self._errors_of([without[k] for k in numbers]) / np.maximum(self.model_errors, 1e-300)
+        errors = self._errors_of([without[k] for k in numbers]) / self.error_units
         return np.where(self.posterior.data.learned, errors, 0.0)
+
+    @property
+    def error_units(self) -> Array:
+        """The errors of M of each state ``(n,)``, at least 1e-4 of the largest, in shares of the state's steps."""
+        steps = np.maximum(self.posterior.data.steps, 1e-300)
+        return np.asarray(np.maximum(self.model_errors, 1e-4 * steps * (self.model_errors / steps).max() + 1e-300))
 
     @functools.cached_property
     def model_errors(self) -> Array:

@@ -41,7 +41,7 @@ class StructureSettings:
 
     #: of each part: executions from which on it is looked for, the left-out error above which it is, and the share of
     #: this error that it must leave at most
-    inputs: tuple[int, float, float] = (3, 0.02, 0.5)
+    inputs: tuple[int, float, float] = (3, 0.02, 0.95)  # the evidence decides
     friction: tuple[int, float, float] = (4, 0.1, 0.5)
     data: tuple[int, float, float] = (3, 0.1, 1 / 3)
     parameter: tuple[int, float, float] = (6, 0.1, 1 / 3)
@@ -227,13 +227,13 @@ def share_left(found: LearnedDynamics, without: LearnedDynamics, settings: Struc
     What the Gaussian processes take for noise is no part of them. Of dry friction, only the rates that it slows count:
     where a joint stops within a step changes its position a little, which nothing predicts.
     """
-    friction, n = found.study.friction, len(without.model_errors)
+    friction, n = found.study.friction, len(without.error_units)
     alone = friction is not None and without.study.friction is None
     states = friction.rates if friction is not None and alone else without.posterior.data.learned
-    units = np.maximum(without.model_errors, 1e-300)
+    units = without.error_units
     noise = float(((found.posterior.deviations[:n] / units)[states] ** 2).sum())
     squares, squares_without = (
-        float(((each.left_out_errors * each.model_errors)[:n][states] ** 2 / units[states] ** 2).sum())
+        float(((each.left_out_errors * each.error_units)[:n][states] ** 2 / units[states] ** 2).sum())
         for each in (found, without)
     )
     noise = min(noise, settings.noise * min(squares, squares_without))

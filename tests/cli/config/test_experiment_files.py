@@ -714,3 +714,14 @@ def test_outputs_are_indices_or_a_function_of_a_module(outputs: str, synthesizer
 def test_outputs_of_a_named_experiment_are_its_own(invoke: Any) -> None:
     Path("e.toml").write_text('experiment = "pendulum"\noutputs = [0]\n')
     assert "both 'experiment' and 'outputs'" in sentence(invoke("run", "e.toml"))
+
+
+def test_a_share_of_the_tasks_is_an_option_of_the_certificate_that_the_command_line_overrides() -> None:
+    settings = ExperimentSettings.model_validate({"experiment": "pendulum", "certificate": {"share": 0.99}})
+    assert settings.certificate_options.left_out == pytest.approx(0.01)
+    assert settings.certified_as({"share": 0.9}).certificate_options.kind.share == 0.9
+    assert settings.certified_as({"share": 1.0}).certificate_options.left_out == 0
+    assert not settings.explores
+    for table in ({"share": 0.4}, {"kind": "posterior", "share": 0.99}):
+        with pytest.raises((ValueError, CtxvalError)):
+            ExperimentSettings.model_validate({"experiment": "pendulum", "certificate": table})

@@ -255,7 +255,8 @@ class _Study:
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
             while chosen is not None and chosen.counts(self.before) and len(self._fitted(chosen)) < most:
-                if chosen.explanation.left < 0.02 or chosen.complete > 0.99:  # nothing is left for another cause
+                is_small = chosen.explanation.left < 0.02 and chosen.complete >= self.settings.named
+                if is_small or chosen.complete > 0.99:  # nothing is left for another cause
                     break
                 better, others = self._chosen(self._ranked(self._fitted(chosen)))
                 if better is not None:  # the first one was chosen without the other ones
@@ -320,11 +321,30 @@ class _Study:
         # What comes to less than a quarter of the evidence of the best one is not worth a fit.
         worth = [result for result in results[: self.settings.fitted] if result[0] <= 0.25 * results[0][0]]
         refined = [explained(self.segments, together, begun) for _, begun, together in worth or results[:1]]
+        refined += [
+            explained(self.segments, (*self.known, *beside, each), screened(self.some, (*self.known, *beside, each))[1])
+            for each in self._simpler(min(refined, key=lambda each: each.criterion))
+        ]
         distinct = list[Explanation]()
         for explanation in sorted(refined, key=lambda each: each.criterion):
             if not any(_is_same(explanation, other) for other in distinct):
                 distinct.append(explanation)
         return distinct
+
+    def _simpler(self, explanation: Explanation) -> list[EffectCandidate]:
+        """Return causes of the same joint with fewer sizes, if a size of the last cause of an explanation is 0."""
+        last = explanation.candidates[-1]
+        sizes = zip(last.effect.sizes, last.parameters, strict=True)
+        if len(last.parameters) < 2 or not any(abs(float(size)) < 0.01 * p.scale for size, p in sizes):
+            return []
+        joint = getattr(last.effect, "joint", None)
+        return [
+            each
+            for each in self.dictionary
+            if len(each.parameters) < len(last.parameters)
+            and getattr(each.effect, "joint", joint) == joint
+            and isinstance(each.effect, Force)
+        ]
 
     def _chosen(self, ranked: list[Explanation]) -> tuple[Explained | None, list[Explained]]:
         """Return the most probable explanation that counts, and those that the executions do not tell from it.

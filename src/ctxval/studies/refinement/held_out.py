@@ -18,6 +18,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import aligned
 from ctxval.core.labels import labels_of
 from ctxval.core.model import Model
+from ctxval.core.state_geometry import geometry_of
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.errors import CtxvalError, InputError, ModelError
 from ctxval.studies.fitting.fit import part_of
@@ -154,12 +155,13 @@ def held_out(learn: Callable[[Records], Model], before: Model, records: Records)
 
 
 def _compared(data: Transitions, runs: Sequence[Trajectory], model: Model, before: Model) -> HeldOut:
+    geometry = geometry_of(before)
     with np.errstate(all="ignore"):
-        errors, first = (data.x_next - each.step(data.x, data.u) for each in (model, before))
+        errors, first = (geometry.difference(data.x_next, each.step(data.x, data.u)) for each in (model, before))
         later, later_first = (_errors_later(each, runs, data.x.shape[1]) for each in (model, before))
     usable, later_usable = (np.isfinite(array).all(axis=1) for array in (first, later_first))
     errors, later = np.where(np.isfinite(errors), errors, first), np.where(np.isfinite(later), later, later_first)
-    pairs, changes = np.concatenate([data.x, data.u], axis=1), data.x_next - data.x
+    pairs, changes = np.concatenate([data.x, data.u], axis=1), geometry.difference(data.x_next, data.x)
     pairs, errors, first, changes = (array[usable] for array in (pairs, errors, first, changes))
     return HeldOut(pairs, errors, first, changes, later[later_usable], later_first[later_usable])
 

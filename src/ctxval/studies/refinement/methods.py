@@ -17,6 +17,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import reason_of
 from ctxval.campaign.campaign import Campaign
 from ctxval.core.model import Model, Step, as_model
+from ctxval.core.state_geometry import PLAIN, geometry_of
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import CtxvalError, InputError, ModelError, UnknownNameError
 from ctxval.learning import PosteriorSettings, learn_posterior
@@ -258,7 +259,9 @@ def exact_correction(model: Model, records: Records) -> Correction | None:
 
 
 def averaged_correction(model: Model, records: Records) -> Correction | None:
-    """Return the mean of a Gaussian process of low rank, which averages noise; None if there is none."""
+    """Return the mean of a Gaussian process of low rank, averaging noise of plain vectors; None if there is none."""
+    if geometry_of(model) != PLAIN:
+        return None
     runs = [Record(run.states, run.inputs, run.states[0]) for run in records.executed]
     if records.own is not None:
         of_model = records.own[:: max(1, len(records.own) // 50_000)]  # of more, only a part is averaged

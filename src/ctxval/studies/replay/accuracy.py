@@ -12,6 +12,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask, Rows, as_floats
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
+from ctxval.core.state_geometry import geometry_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.data.recordings import Recordings
 from ctxval.errors import CtxvalError, ModelError
@@ -125,8 +126,8 @@ def predicted(model: Model, where: Windows, steps: int) -> tuple[Array, Array]:
     x = start = where.states()
     for k in range(steps):
         x = stepped(model, x, where.inputs(k))
-    reached = where.states(steps)
-    return x - reached, reached - start
+    reached, geometry = where.states(steps), geometry_of(model)
+    return geometry.difference(x, reached), geometry.difference(reached, start)
 
 
 def stepped(model: Model, x: Array, u: Array) -> Array:
