@@ -10,7 +10,7 @@ import numpy as np
 from ctxval.report import Card, CardVerdict
 from json_lines import JsonLines
 from robots import double_pendulum
-from robots.study import CAMPAIGNS, CAUSES, KINDS, RESULTS, SECONDS, SHARES
+from robots.study import CAMPAIGNS, CAUSES, KINDS, QUANTILES, RESULTS, SECONDS, SHARES, SHOWN
 
 SERVO = JsonLines(RESULTS / "servo.jsonl", ("model", "share", "seed"))
 SERVO_CAUSES = JsonLines(RESULTS / "causes_servo.jsonl", ("rule", "seed"))
@@ -30,6 +30,8 @@ def all_cards() -> Iterable[Card]:
         for model in (*double_pendulum.PUBLISHED, *double_pendulum.LEARNED):
             if ("double pendulum", model, f"{seconds} s", SHARES[0]) in CAMPAIGNS:
                 yield _card_of_pendulum(model, seconds)
+    for model in double_pendulum.PUBLISHED:
+        yield _card_of_repeats(model)
     for model in ("m1", "m3", "m4"):
         yield _card_of_servo(model)
 
@@ -108,6 +110,28 @@ def _card_of_pendulum(model: str, seconds: float) -> Card:
     )
 
 
+def _card_of_repeats(model: str) -> Card:
+    lines = [QUANTILES[model, 1.5, quantile, share] for quantile in SHOWN for share in SHARES]
+    largest = lines[0]["largest"]
+    return Card(
+        "pendubot, TVLQR: undisturbed and perturbed, ten repeats each",
+        f"model {model}",
+        "model and " + OF_PENDULUM,
+        LARGEST.format("both angles up to 1.5 s"),
+        "rad",
+        largest,
+        largest,
+        tuple(
+            CardVerdict(line["share"] * largest, f"{100 * line['quantile']:g} %: {line['answer']}", line["executions"])
+            for line in lines
+        ),
+        20,
+        "",
+        command=f"ctxval run robots.double_pendulum:experiment --option folder=FOLDER --option model={model} "
+        f"--option seconds=1.5 --option repeats=true --threshold {SHARES[1] * largest:.3g} --kind suite",
+    )
+
+
 def _card_of_servo(model: str) -> Card:
     lines = {share: SERVO.select(model=model, share=share) for share in SHARES}
     largest = max(max(line["distances"]) for line in lines[1.1])
@@ -153,5 +177,6 @@ def repair(told: dict[str, Any] | None) -> str:
     if told is None:
         return ""
     if "after" not in told:
-        return "none, because no cause is named"
+        seen = str(told["sentence"]).startswith("The recordings show: ")
+        return f"none, because {'what is seen is not all' if seen else 'no cause is named'}"
     return f"{told['before']:.3g} to {told['after']:.3g} rad on {told['of']} others, nearer in {told['nearer']}"

@@ -34,6 +34,8 @@ CONDITIONS = {
 }
 """The recorded conditions, by the names of their files."""
 
+IN_TURN = UNDISTURBED, PERTURBED  # tasks whose repeats are executed in turn
+
 DT = 0.0025  # s, the mean period of the recordings
 REFERENCE_DT = 0.001  # s, by which the recorded reference angles are the integral of the recorded reference rates
 GRAVITY, GEAR = 9.81, 6.0
@@ -232,14 +234,24 @@ def learned(folder: Path, kind: str) -> Model:
 def validation(folder: Path, model: Model, seconds: float, condition: str = UNDISTURBED) -> Validation:
     """Return the validation of a model against the repeats of a condition, by the largest deviation of both angles."""
     repeats = runs(folder, condition, seconds)
+    suite = TaskSuite({name: {"number": int(name.split()[1])} for name in repeats})
+    return _against(systems.Recorded(repeats), suite, folder, model, seconds)
 
+
+def repeated(folder: Path, model: Model, seconds: float) -> Validation:
+    """Return the validation against two tasks, undisturbed and perturbed, whose repeats are executed in turn."""
+    recorded = systems.Recorded({each: list(runs(folder, each, seconds).values()) for each in IN_TURN})
+    return _against(recorded, TaskSuite(recorded.names, repeats=recorded.repeats), folder, model, seconds)
+
+
+def _against(recorded: systems.Recorded, suite: TaskSuite, folder: Path, model: Model, seconds: float) -> Validation:
     def task(p: Parameters) -> Task:
         return Task(np.zeros(4), goal=TOP, horizon=round(seconds / DT), dt=DT)
 
     return Validation(
-        space=TaskSuite({name: {"number": int(name.split()[1])} for name in repeats}),
+        space=suite,
         task=task,
-        system=systems.Recorded(repeats),
+        system=recorded,
         model=model,
         synthesizer=Published(controller(folder)),
         distance=distances.MaximumDeviation(norm=np.inf, components=(0, 1)),
@@ -247,10 +259,16 @@ def validation(folder: Path, model: Model, seconds: float, condition: str = UNDI
     )
 
 
-def experiment(folder: str, seed: int = 0, model: str | float = "1.0", seconds: float = 3.0) -> Experiment:
-    """Return the validation of a published model, or of one that is learned, by its name."""
+def experiment(
+    folder: str, seed: int = 0, model: str | float = "1.0", seconds: float = 3.0, repeats: bool = False
+) -> Experiment:
+    """Return the validation of a published model, or of one that is learned, by its name.
+
+    Each repeat is a task, or with ``repeats`` one of the executions of two tasks: undisturbed and perturbed.
+    """
     name = str(model)  # a command line gives 1.0 as a number
     if name not in PUBLISHED and name not in LEARNED:
         raise InputError(f"model must be one of {', '.join([*PUBLISHED, *LEARNED])}, got {name!r}.")
     chosen = PUBLISHED[name] if name in PUBLISHED else learned(Path(folder), name)
-    return Experiment(f"double pendulum, model {name}", validation(Path(folder), chosen, seconds), budget=10)
+    made = (repeated if repeats else validation)(Path(folder), chosen, seconds)
+    return Experiment(f"double pendulum, model {name}", made, budget=20 if repeats else 10)

@@ -17,8 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from ctxval import Campaign, Task, TaskSuite, Validation
+from ctxval import Campaign, Task, TaskSuite, Validation, searches
 from ctxval._util.arrays import Array, single_threaded
+from ctxval.certificates.automatic import WholeSuite
+from ctxval.certificates.options import CertificateOptions
 from ctxval.core.controller import started
 from ctxval.data.recorded_system import RecordedInputsWarning
 from ctxval.studies.causes import find_causes
@@ -34,6 +36,7 @@ SHARES = (0.9, 1.1)  # of d*, the thresholds
 SEEDS = 10  # draws of the five motions
 KINDS = ("linear", "physical")  # models of the arm
 SECONDS = (1.5, 3.0)
+SHOWN = (0.9, 0.69)  # quantiles of the executions of each task; ten repeats of two tasks show 69.2 %
 CERTIFIED = 6  # undisturbed repeats whose verdict is watched, or explained; the others are held out
 FALSE_ALARMS = 0.01
 EXPLAINED = 8  # executions of the arm that causes are found in
@@ -41,6 +44,7 @@ EXPLAINED = 8  # executions of the arm that causes are found in
 CAMPAIGNS = JsonLines(RESULTS / "robots.jsonl", ("robot", "model", "about", "share"))
 REPEATS = JsonLines(RESULTS / "robots_repeats.jsonl", ("condition", "seconds"))
 CAUSES = JsonLines(RESULTS / "robots_causes.jsonl", ("robot", "model", "about"))
+QUANTILES = JsonLines(RESULTS / "robots_quantiles.jsonl", ("model", "seconds", "quantile", "share"))
 WATCHED = JsonLines(RESULTS / "robots_watched.jsonl", ("model", "seconds"))
 
 Key = tuple[Any, ...]
@@ -142,6 +146,18 @@ def explained(known: Validation, unknown: Validation, seed: int) -> dict[str, An
     return {**found, "seconds": round(time.process_time() - started, 1)}
 
 
+def of_quantile(folder: Path, model: str, seconds: float, quantile: float, share: float) -> dict[str, Any]:
+    """Return the verdict on a quantile of the executions of two tasks, each with ten recordings in turn."""
+    validation = double_pendulum.repeated(folder, double_pendulum.PUBLISHED[model], seconds)
+    single = [double_pendulum.validation(folder, validation.model, seconds, each) for each in double_pendulum.IN_TURN]
+    largest = float(max(all_distances(each).max() for each in single))
+    options = CertificateOptions(WholeSuite(quantile))
+    campaign = Campaign(validation, search=searches.by_name("random")).run(20, share * largest, certificate=options)
+    verdict = campaign.verdict(share * largest, certificate=options)
+    found = {"answer": verdict.answer, "reason": verdict.reason, "executions": len(campaign.trials), "largest": largest}
+    return {**found, "above": sum((trial.distance or 0.0) > share * largest for trial in campaign.trials)}
+
+
 def watched(folder: Path, model: str, seconds: float) -> dict[str, Any]:
     """Return how a watch over a verdict on undisturbed repeats judges the others, and perturbed ones."""
     validation, started = of_pendulum(folder, model, seconds), time.process_time()
@@ -182,6 +198,11 @@ def main() -> None:
                     validation = of_pendulum(folder, model, seconds)
                     key = "double pendulum", model, f"{seconds} s", share
                     store(CAMPAIGNS, key, lambda v=validation, share=share: decided(v, share, 0, 1.0))
+        for model in double_pendulum.PUBLISHED:
+            for quantile in SHOWN:
+                for share in SHARES:
+                    about = model, 1.5, quantile, share
+                    store(QUANTILES, about, lambda about=about: of_quantile(folder, *about))
         store(WATCHED, ("1.0", 1.5), lambda: watched(folder, "1.0", 1.5))
         for model in double_pendulum.PUBLISHED:
             key = "double pendulum", model, "1.5 s"
