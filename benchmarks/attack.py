@@ -246,7 +246,7 @@ def _data(rng: Rng, folder: Path, base: Path) -> Case:
         case _:
             content = archives.onnx(rng, (base / "network.onnx").read_bytes())
     archives.placed(rng, folder / name, content)
-    model = f'type = "Onnx"\nsource = "{name}"' if kind == 2 else f'type = "Linear"\ndata = ["{name}"]'
+    model = f'type = "Onnx"\nsource = "{name}"' if kind == 2 else f'type = "Linear"\ndata = {{ logs = ["{name}"] }}'
     begin, end = text.index("[model]"), text.index("[synthesizer]")
     (folder / experiments.FILE).write_text(f"{text[:begin]}[model]\n{model}\n\n{text[end:]}")
     return Case(experiments.run_or_check(rng), code=True)

@@ -96,21 +96,20 @@ def page(results: JsonLines = STORED) -> GeneratedPage:
     """Return the page of the stored campaigns."""
     rows = []
     for case, name in CASES.items():
-        cells = [name]
+        cells, validated, cpu = [name], list[float](), list[float]()
         for factor in FACTORS:
-            of_case = results.select(case=case, factor=factor)
-            for answer in ("validated", "falsified", "undecided"):
-                cells.append(str(sum(each["answer"] == answer for each in of_case)))
-            cells.append(f"{np.median([each['executions'] for each in of_case]):g}" if of_case else "-")
-        bounds = [each["bound"] for each in results.select(case=case, factor=1.25) if each["answer"] == "validated"]
-        cpu = [each["cpu"] for factor in FACTORS for each in results.select(case=case, factor=factor)]
-        cells += [f"{np.median(bounds):.2f}" if bounds else "-", f"{np.median(cpu):.1f}" if cpu else "-"]
+            campaigns = results.select(case=case, factor=factor)
+            answers = [each["answer"] for each in campaigns]
+            counts = "/".join(str(answers.count(answer)) for answer in ("validated", "falsified", "undecided"))
+            executions = f"{np.median([each['executions'] for each in campaigns]):g}" if campaigns else "-"
+            cells += [counts if campaigns else "not run", executions]
+            cpu += [each["cpu"] for each in campaigns]
+            validated = [each["bound"] for each in campaigns if each["answer"] == "validated"]
+        cells += [f"{np.median(validated):.2f}" if validated else "-", f"{np.median(cpu):.1f}" if cpu else "-"]
         rows.append(cells)
-    short = [[row[0], "/".join(row[1:4]), row[4], "/".join(row[5:8]), row[8], *row[9:]] for row in rows]
-    answers = "validated/falsified/undecided"
-    header = ("system", f"0.95 q: {answers}", "executions", f"1.25 q: {answers}", "executions", "bound / q",
-              "CPU s an execution")  # fmt: skip
-    return GeneratedPage("how-to/share.md", reflowed(TEXT.replace("{table}", table(header, short))))
+    answers_of = [f"{factor:g} q: validated/falsified/undecided" for factor in FACTORS]
+    header = ("system", answers_of[0], "executions", answers_of[1], "executions", "bound / q", "CPU s an execution")
+    return GeneratedPage("how-to/share.md", reflowed(TEXT.replace("{table}", table(header, rows))))
 
 
 def main() -> None:
