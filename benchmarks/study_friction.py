@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ctxval import Campaign
-from ctxval.learning.dynamics_study import DynamicsStudy
+from ctxval.learning.structure import StructureSearch
 from friction_systems import AT_REST, DEVELOPED_AT_REST, DEVELOPMENT, REGULAR, SYSTEMS
 from json_lines import JsonLines
 from page_tables import GeneratedPage, reflowed, table
@@ -36,14 +36,14 @@ def truth(system: str) -> float:
 def study(system: str, share: float, seed: int, looked_for: bool) -> dict[str, Any]:
     """Return how one campaign ends."""
     threshold, begun = share * truth(system), time.process_time()
-    finds = DynamicsStudy._with_friction
+    finds = StructureSearch.with_friction
     if not looked_for:
-        DynamicsStudy._with_friction = lambda *_: None  # type: ignore[method-assign,assignment]
+        StructureSearch.with_friction = lambda *_: None  # type: ignore[method-assign,assignment]
     try:
         campaign = Campaign(SYSTEMS[system]().validation, seed=seed).run(BUDGET, threshold, thinking=np.inf)
         verdict = campaign.verdict(threshold)
     finally:
-        DynamicsStudy._with_friction = finds  # type: ignore[method-assign]
+        StructureSearch.with_friction = finds  # type: ignore[method-assign]
     details = {} if verdict.certificate is None else verdict.certificate.details
     return {
         "system": system,

@@ -40,7 +40,7 @@ def test_the_repaired_model_is_validated_under_its_own_controllers() -> None:
 def test_an_error_without_a_known_cause_ends_the_refinement() -> None:
     model = make_validation().model
     campaign = executed(lambda x, u: model.step(x, u) + 0.02 * np.sin(60 * x))
-    with refuses(InputError, 22):
+    with refuses(InputError, 25):
         refine(campaign, 1e-6, 6, method=CauseRepair(campaign))
 
 
