@@ -115,6 +115,9 @@ class TaskSuite(TaskSpace):
         """Return the name of the member at one point ``(d,)`` of the unit cube."""
         return self.task_names[int(self.rows_at(unit))]
 
+    def candidates(self, points: Array) -> Array:
+        return self.members
+
     def remaining(self, known: Array) -> Array:
         gone = set(self.rows_at(known).tolist()) if len(known) else set[int]()
         return self.members[[row for row in range(len(self)) if row not in gone]]
