@@ -343,3 +343,27 @@ def test_each_task_is_counted_once_whether_it_is_planned_or_kept(batched: bool) 
         planner.plan(POINTS)
         planner.plan(POINTS)
     assert heard[-1].done == 2 * len(POINTS)
+
+
+class Falling(controllers.Policy):
+    fall = controllers.Fall(height=0.52)
+
+
+def test_robots_lie_still_from_their_fall_on_even_if_m_diverges_there() -> None:
+    def sink(x: Array, u: Array) -> Array:
+        moved = np.array(x)
+        moved[..., 2] += 0.1 * x[..., 9]
+        return np.where(x[..., 2:3] < 0.3, np.inf, moved)
+
+    validation = Validation(
+        space=TaskSpace(speed=(0.5, 1.5, "m/s")),
+        task=lambda p: Task([0, 0, 1, 1, 0, 0, 0, 0, 0, -p.speed, 0, 0, 0], horizon=10, dt=0.1),
+        system=systems.Simulated(sink, vectorized=True),
+        model=models.Function(sink, vectorized=True),
+        synthesizer=Falling(lambda t, x, task: 0 * x[..., :1]),
+        distance=distances.FinalState(components=[2]),
+    )
+    [plan] = LoopPlanner(validation).plan(np.array([[0.0], [1.0]]))
+    assert plan.nominal.finite.all()
+    assert plan.nominal.final_state[:, 2] == pytest.approx([0.5, 0.4])
+    assert not plan.nominal.states[1, 5:, 7:].any()

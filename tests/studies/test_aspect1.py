@@ -20,6 +20,8 @@ from ctxval import (
     models,
     systems,
 )
+from ctxval._util.arrays import Array
+from ctxval.cli.config.check import aspect1_findings
 from ctxval.distances import FinalState, GoalError, MaximumDeviation, MeanDeviation, TrackingError
 from ctxval.errors import DesignError, InputError
 from ctxval.searches import Random
@@ -211,3 +213,29 @@ def test_the_combined_measure_of_remark_1_is_a_distance() -> None:
     # d(p) = || xi_S(H; x_init, pi_p) - p ||_1, for regulation to p.
     outcome = make_validation(distance=distances.GoalError(norm=1)).outcome([0.5])
     assert outcome.distance == pytest.approx(np.abs(outcome.system_trajectory.final_state - [0.5, 0.0]).sum())
+
+
+class Standing(controllers.Policy):
+    fall = controllers.Fall(height=0.5)
+
+
+def test_a_robot_of_m_that_falls_does_not_complete_its_tasks() -> None:
+    def step(x: Array, u: Array) -> Array:  # a base that sinks the faster the faster it is
+        return np.concatenate([x[..., :2], x[..., 2:3] - 0.1 * x[..., 7:8] ** 2, x[..., 3:]], axis=-1)
+
+    validation = cart(
+        space=TaskSpace(speed=(0.0, 1.0, "m/s")),
+        task=lambda p: Task([0, 0, 1, 1, 0, 0, 0, p.speed, 0, 0, 0, 0, 0], command=[p.speed, 0, 0], horizon=6, dt=DT),
+        model=models.Function(step, vectorized=True),
+        synthesizer=Standing(lambda t, x, task: 0 * x[..., :1]),
+        distance=distances.BodyVelocity(yaw=0.5),
+    )
+    assert aspect1.completion(validation) == distances.CommandError(yaw=0.5)
+    report = aspect1.check(validation, tasks=12)
+    assert report.completes is False
+    fell = [float(task.parameters["speed"]) > np.sqrt(0.5 / 0.6) for task in report.simulated]
+    assert [task.fell for task in report.simulated] == fell
+    assert report.exceeding == len(report.fallen) == sum(fell) > 0
+    assert len(report.to_json()["fallen"]) == sum(fell)
+    findings = aspect1_findings(report)
+    assert [finding.state for finding in findings if finding.check == "falls"] == ["failed"]

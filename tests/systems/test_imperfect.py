@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ctxval import Task, rollout, systems
+from ctxval import Task, models, rollout, systems
 from ctxval._util.arrays import Array
 from ctxval._util.describe import describe
 from ctxval.cli.config.parts import part
@@ -104,3 +104,28 @@ def test_a_simulator_is_a_system_with_latency() -> None:
     run = system.execute(pi, task)
     again = iter([np.zeros(1), *run.inputs])
     assert systems.MuJoCo(mjcf, substeps=2).execute(lambda t, x: next(again), task).states == pytest.approx(run.states)
+
+
+def test_payload_friction_and_weak_servos_are_changes_of_the_mjcf() -> None:
+    pytest.importorskip("mujoco")
+    text = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="9 9 1" friction="{mu}"/>
+    <body name="sledge" pos="0 0 0.1"><joint name="x" type="slide" axis="1 0 0"/>
+    <joint name="z" type="slide" axis="0 0 1"/>
+    <geom type="box" size=".1 .1 .1" mass="{mass}" friction="{mu}"/></body></worldbody><actuator>
+    <position joint="x" kp="{kp}"/></actuator></mujoco>"""
+    usual, other = text.format(mu=0.4, mass=2, kp=50), text.format(mu=0.2, mass=3, kp=40)
+    task = Task([0.0, 0.0, 0.3, 0.0], horizon=30, dt=0.02)
+
+    def push(t: int, x: Array) -> Array:
+        return np.array([0.5])
+
+    changed = systems.Imperfect(models.MuJoCo(usual, dt=0.02), payload={"sledge": 1.0}, friction=0.5, strength=0.8)
+    run = changed.execute(push, task)
+    assert run.states == pytest.approx(systems.MuJoCo(other, substeps=2).execute(push, task).states, abs=1e-3)
+    plain = systems.MuJoCo(usual, substeps=2).execute(push, task)
+    assert np.abs(plain.states - run.states).max() > 0.03
+    assert describe(changed)["payload"] == {"sledge": 1.0}
+    with refuses(InputError, "wing"):
+        systems.Imperfect(models.MuJoCo(usual), payload={"wing": 1.0})
+    with refuses(InputError, "MJCF"):
+        systems.Imperfect(step, friction=0.5)

@@ -117,7 +117,7 @@ class LoopPlanner:
         parts = self.validation
         task = parts.task_at(parts.space.parameters(parts.space.from_unit(chosen)))
         controller = parts.synthesizer.design(task, parts.model)
-        nominal = parts.closed_loop(controller, task)
+        nominal = self._until_fall(parts.closed_loop(controller, task), task)
         if nominal.batch_shape != chosen.shape[:-1]:
             raise ValueError("the task function did not return one task for each point")
         return PlannedTasks(rows, task, controller, nominal)
@@ -146,6 +146,11 @@ class LoopPlanner:
             advance(some.size, units=_UNITS)
         return draws.reduced(distances.reshape(S * R, q))
 
+    def _until_fall(self, run: Trajectory, task: Task) -> Trajectory:
+        """Return loops in which robots lie still from their fall on; what M predicts afterwards does not matter."""
+        fall = self.validation.fall
+        return run if fall is None else fall.lying(run, task.times)
+
     def _loops(self, draws: Draws, planned: PlannedTasks, rows: Rows, tasks: int) -> Loops:
         """Return closed loops of draws; ``rows`` ``(L, q)`` says which, of all with so many tasks for each system."""
         task, L = planned.task, len(rows)
@@ -157,6 +162,7 @@ class LoopPlanner:
         else:
             alone = (draws.begun(each, tasks, task.initial_state) for each in rows)
             loops = [rollout(step, planned.controller, task.starting_at(first)) for first, step in alone]
+        loops = [self._until_fall(loop, task) for loop in loops]
         states, inputs = np.stack([loop.states for loop in loops]), np.stack([loop.inputs for loop in loops])
         shape = L, len(planned.rows)
         distances = np.array([self.compared(planned, loop) for loop in loops]).reshape(shape)

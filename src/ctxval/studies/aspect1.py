@@ -28,10 +28,10 @@ from ctxval.core.distance import Distance
 from ctxval.core.floating_base import UntilFall
 from ctxval.core.plan import Plan
 from ctxval.core.soundness import Flips, InputSaturation, aimed_states, flips, saturation
-from ctxval.core.task import Task
-from ctxval.core.trial import Trials
+from ctxval.core.task import COMMAND, Task
+from ctxval.core.trial import FELL, Trial, Trials
 from ctxval.core.validation import Validation
-from ctxval.distances import GoalError, MeanDeviation, StateNorm, TrackingError
+from ctxval.distances import BodyVelocity, CommandError, GoalError, MeanDeviation, StateNorm, TrackingError
 from ctxval.errors import CtxvalError, DesignError, InputError, ModelError
 from ctxval.searches import Search, by_name
 
@@ -47,6 +47,7 @@ class SimulatedTask:
     parameters: dict[str, Any]
     error: float | None
     reason: str = ""  #: why there is no error: no controller could be designed, or M diverges
+    fell: bool = False  #: whether the robot of M fell, by the condition that the synthesizer knows
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,15 +84,20 @@ class Aspect1Report:
         return tuple(task for task in self.simulated if task.error is None)
 
     @property
+    def fallen(self) -> tuple[SimulatedTask, ...]:
+        """The tasks in which the robot of M fell."""
+        return tuple(task for task in self.simulated if task.fell)
+
+    @property
     def exceeding(self) -> int:
-        """The number of simulated tasks that M does not complete: those above the threshold, and those that failed."""
+        """The number of tasks that M does not complete: above the threshold, with a fall, or without an error."""
         limit = np.inf if self.threshold is None else self.threshold
-        return sum(task.error is None or task.error > limit for task in self.simulated)
+        return sum(task.error is None or task.error > limit or task.fell for task in self.simulated)
 
     @property
     def completes(self) -> bool | None:
-        """Whether M completed all simulated tasks; None without a threshold, unless a task failed."""
-        return None if self.threshold is None and not self.failed else not self.exceeding
+        """Whether M completed all simulated tasks; None without a threshold, unless a task failed or a robot fell."""
+        return None if self.threshold is None and not self.failed + self.fallen else not self.exceeding
 
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values."""
@@ -109,6 +115,7 @@ class Aspect1Report:
             "flips": flips and {**asdict(flips), "example": self.flipped},
             "saturation": saturation and dict(zip(self.inputs, saturation.shares.tolist(), strict=False)),
             "not_converged": list(self.not_converged),
+            "fallen": [asdict(task) for task in self.fallen],
         }
 
 
@@ -153,12 +160,15 @@ def completion(validation: Validation) -> Distance:
 
     It has the norm, the states, the weights and the scales of that distance. For tasks with a goal it is
     :class:`ctxval.distances.GoalError`, and for tasks with a changing reference
-    :class:`ctxval.distances.TrackingError`. If the distance compares all states, those are left out that the
+    :class:`ctxval.distances.TrackingError`. For a :class:`ctxval.distances.BodyVelocity` and tasks with a command it is
+    :class:`ctxval.distances.CommandError`. If the distance compares all states, those are left out that the
     synthesizer does not bring to a goal.
     """
     space, distance = validation.space, validation.distance
     distance = distance.distance if isinstance(distance, UntilFall) else distance
     task = validation.task_at(space.parameters(0.5 * (space.low + space.high)))
+    if isinstance(distance, BodyVelocity) and not task.has_goal and COMMAND in task.environment:
+        return distance if isinstance(distance, CommandError) else CommandError(**vars(distance))
     if not isinstance(task, Task) or not task.has_goal:
         raise InputError(
             "the tasks have neither a goal nor a reference, so the model has nothing to complete: give a goal, or a "
@@ -199,7 +209,7 @@ def _report(campaign: Campaign, distance: Distance, threshold: float | None, see
         distance,
         validation.labels.units,
         threshold,
-        tuple(SimulatedTask(trial.parameters, trial.distance, text_of(trial.failure or "")) for trial in ordered),
+        tuple(map(_simulated, ordered)),
         verdict,
         share,
         campaign.provenance.distribution,
@@ -210,6 +220,10 @@ def _report(campaign: Campaign, distance: Distance, threshold: float | None, see
         tuple(task for task, ok in zip(where, converged, strict=True) if ok is not None and not ok),
         sum(ok is not None for ok in converged),
     )
+
+
+def _simulated(trial: Trial) -> SimulatedTask:
+    return SimulatedTask(trial.parameters, trial.distance, text_of(trial.failure or ""), FELL in (trial.note or {}))
 
 
 def _with_neighbours(points: Array, rng: np.random.Generator) -> Array:

@@ -99,7 +99,10 @@ class Imperfect:
         lag: time constant in steps with which the actuators approach the input; 0 if they follow at once. The mean over
             a step acts in it.
         before: the inputs before the first one acts, a number or shape ``(m,)``, such as the pose of servos.
-        strength: factor of the inputs that act, a number or shape ``(m,)``, such as that of weak motors.
+        strength: factor of the inputs that act, a number or shape ``(m,)``, as of weak motors; of an MJCF, whose
+            actuators may be servos, factor of their forces.
+        payload: masses in kg that are added to bodies of an MJCF, by their names; None if there are none.
+        friction: factor of the sliding friction of all geoms of an MJCF.
         push: what a push adds to states, by their indices, such as ``{7: 0.5}``; None if there is none.
         push_time: seconds after which it does, rounded to a step.
         seed: with a seed, noise is a function of it, of the task and of how often this object has executed.
@@ -119,6 +122,8 @@ class Imperfect:
         lag: NonNegativeFloat = 0.0,
         before: ArrayLike = 0.0,
         strength: ArrayLike = 1.0,
+        payload: Mapping[str, float] | None = None,
+        friction: NonNegativeFloat = 1.0,
         push: Mapping[Any, float] | None = None,
         push_time: NonNegativeFloat = 0.0,
         vectorized: bool = False,
@@ -132,15 +137,39 @@ class Imperfect:
             if not (np.isfinite(getattr(self, name)) & (getattr(self, name) >= 0)).all():
                 raise InputError(f"{name} must be finite and not negative, got {getattr(self, name).tolist()}.")
         self.before, self.strength = as_finite("before", before), as_finite("strength", strength)
+        self.payload, self.friction = dict(payload or {}), friction
+        self._factor = self.strength  # of the inputs
+        if self.payload or friction != 1 or (self.strength != 1).any():
+            self._alter()
         with reworded("push must be numbers by the indices of states", ValueError, TypeError):
             self.push = {int(index): float(change) for index, change in (push or {}).items()}
         self.delay, self.lag, self.seed, self.push_time = delay, lag, seed, push_time
         self._executed = 0
 
+    def _alter(self) -> None:
+        """Change the masses, the friction and the actuators of an MJCF; refuse the first two of other models."""
+        changed = getattr(self.model, "changed", None)  # of models.MuJoCo
+        if changed is None:
+            if self.payload or self.friction != 1:
+                raise InputError("payload and friction need a model of an MJCF, such as models.MuJoCo.")
+            return
+
+        def change(model: Any) -> None:
+            for name, mass in self.payload.items():
+                with reworded("payload", KeyError):
+                    model.body(name).mass += mass
+            model.geom_friction[:, 0] *= self.friction
+            model.pair_friction[:, :2] *= self.friction
+            for parameters in (model.actuator_gainprm, model.actuator_biasprm):
+                parameters[:, :3] *= np.broadcast_to(self.strength, (model.nu,))[:, None]
+
+        self.model, self._factor = changed(change), np.ones(())
+
     def describe(self) -> dict[str, Any]:
         """Return what identifies this system in a store."""
         known = {name: value for name, value in vars(self).items() if not name.startswith("_")}
         usual = {"before": not self.before.any(), "strength": (self.strength == 1.0).all(), "push": not self.push}
+        usual |= {"payload": not self.payload, "friction": self.friction == 1.0}
         usual["push_time"] = usual["push"]
         return {name: value for name, value in known.items() if not usual.get(name)}
 
@@ -169,7 +198,7 @@ class Imperfect:
                 truth[..., list(self.push)] += list(self.push.values())
             steps += 1
             u, memory = actuator.follow(u - self.before, memory)
-            truth = of_model(truth, self.strength * (u + self.before))
+            truth = of_model(truth, self._factor * (u + self.before))
             if self.process.any():
                 truth = truth + self.process * rng.standard_normal(truth.shape)
             return record(truth)

@@ -305,6 +305,7 @@ def aspect1_findings(report: Aspect1Report) -> list[Checked]:
     return _checked(
         {
             "tasks on the model": _completion(report),
+            "falls": _falls(report),
             "neighbouring tasks": _flips(report),
             "limits of the inputs": _saturated(report),
             "convergence of the designs": _convergence(report.not_converged, report.designs),
@@ -335,6 +336,12 @@ def _completion(report: Aspect1Report) -> Findings:
         tasks = "of all tasks" if report.distribution is None else of_tasks(report.distribution)
         share = f"; with confidence 0.95 it does not complete at most {100 * (report.share or 0):.3g} % {tasks}"
         yield "ok", f"M completes all of them: {ends}{share}{held}"
+
+
+def _falls(report: Aspect1Report) -> Findings:
+    if report.fallen:
+        count, where = len(report.fallen), task_text(report.fallen[0].parameters)
+        yield "failed", f"the robot of M falls in {count} of {len(report.simulated)} tasks, such as {where}"
 
 
 def _flips(report: Aspect1Report) -> Findings:
