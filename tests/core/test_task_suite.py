@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctxval import Task, TaskSuite, Validation, controllers, distances, models, systems
+from ctxval import Task, TaskSpace, TaskSuite, Validation, controllers, distances, models, systems
 from ctxval.core.exchange import read_task, write_task
 from ctxval.errors import InputError, UnknownNameError
 from facts import refuses
@@ -40,6 +40,13 @@ def test_every_point_of_the_cube_stands_for_a_task(rows: list[tuple[int, int]], 
     assert np.array_equal(suite.from_unit(suite.rounded(unit)), suite.from_unit(unit))
     assert np.array_equal(suite.to_unit(suite.from_unit(unit)), suite.rounded(unit))
     assert all(row.tobytes() in members for row in suite.unit_draws(5, np.random.default_rng(seed)))
+
+
+def test_a_search_may_choose_the_members_of_a_suite_and_any_point_of_a_box() -> None:
+    points = np.random.default_rng(0).random((3, SUITE.dimension))
+    box = TaskSpace(**dict.fromkeys(SUITE.names, (0.0, 1.0)))
+    np.testing.assert_array_equal(SUITE.candidates(points), SUITE.members)
+    np.testing.assert_array_equal(box.candidates(points), points)
 
 
 @given(suites, st.data())

@@ -103,9 +103,7 @@ class CampaignThinking:
         if self._limited and self._known(trials) is None:
             space = self._validation.space
             points = np.random.default_rng(0).random((16, space.dimension))
-            measured = Speed.measured(
-                self._validation, points if space.members is None else space.members[:16], self._settings
-            )
+            measured = Speed.measured(self._validation, space.candidates(points)[:16], self._settings)
             self._speed = None if measured is None else Speed.from_json(speed_to_json(measured))
 
     @property

@@ -229,6 +229,10 @@ class TaskSpace:
         """Return what a sentence calls the task at a point ``(d,)`` of the space: its parameters by their labels."""
         return dict(zip(self.labels, point.tolist(), strict=True))
 
+    def candidates(self, points: Array) -> Array:
+        """Return the tasks that a search may choose, ``(m, d)``: the given points of the unit cube, or all members."""
+        return points
+
     def remaining(self, known: Array) -> Array | None:
         """Return the members that may follow executions at points ``(n, d)``; None if tasks fill the box."""
         return None

@@ -129,6 +129,9 @@ class TaskSuite(TaskSpace):
         """Return how many of points ``(n, d)`` of the unit cube are executions of each member, ``(N,)``."""
         return np.bincount(self.rows_at(known) if len(known) else [], minlength=len(self))
 
+    def candidates(self, points: Array) -> Array:
+        return self.members
+
     def remaining(self, known: Array) -> Array:
         executions = self.executions(known)
         return np.asarray(self.members[executions == min(executions.min(), self.repeats - 1)])

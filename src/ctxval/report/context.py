@@ -22,7 +22,7 @@ from ctxval.certificates import Certificate, CertificateOptions, Provenance, Ver
 from ctxval.certificates.envelope import Envelope
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.space import TaskSpace
-from ctxval.core.task_suite import TASK, TaskSuite
+from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial, Trials, designs_sentence
 from ctxval.core.validation import Validation
@@ -139,14 +139,11 @@ class ReportContext(ShortRepr):
     @property
     def task_labels(self) -> tuple[str, ...]:
         """What heads the columns of :meth:`tasks_of`: the parameters with their units, or ``task``."""
-        return self.space.labels if self.suite is None else (TASK,)
+        return tuple(self.space.labelled(self.space.low))
 
     def tasks_of(self, trials: Sequence[Trial]) -> list[list[float | str]]:
         """Return one row for each trial: the parameters of its task, or its name if it is one of a suite."""
-        points = self.coordinates(trials)
-        if self.suite is None:
-            return [list(point) for point in points.tolist()]
-        return [[self.suite.task_names_at(point)] for point in points]
+        return [list(self.space.labelled(point).values()) for point in self.coordinates(trials)]
 
     def coordinates(self, trials: Sequence[Trial]) -> Array:
         """Return the tasks of trials in the units of the parameters, ``(n, d)``."""

@@ -116,7 +116,7 @@ class Candidate:
         rng, count = np.random.default_rng([self.seed, 0x706F]), 400 if self._batched else 48
         points = rng.random((count, self._space.dimension))
         snapped = rng.random(points.shape) < 0.5 * (np.arange(count) % 2)[:, None]  # maxima often lie at bounds
-        points = np.where(snapped, np.round(points), points) if self._space.members is None else self._space.members
+        points = self._space.candidates(np.where(snapped, np.round(points), points))
         with stage("predicting distances", len(points), "designs"):
             expected = prediction.expected(points)[0]
         best = int(np.argmax(np.where(np.isfinite(expected), expected, -np.inf)))

@@ -127,7 +127,7 @@ def require_safe_tasks(validation: Validation) -> float:
     distance, planner, space = spec_distance(validation), LoopPlanner(validation), validation.space
     plan = validation.plan(0.5 * (space.low + space.high))
     distance.spec.robustness(plan.model_trajectory, plan.task)  # refuses sets of other dimensions
-    unit = space.members if space.members is not None else space.unit_draws(512, np.random.default_rng([0, 1]))
+    unit = space.candidates(space.unit_draws(512, np.random.default_rng([0, 1])))
     least = distance.margin or 0.0
     share = float((on_model(planner, distance.spec, unit[: 512 if planner.batched else 100]) > least).mean())
     if not share:
