@@ -128,7 +128,7 @@ def _card_of_repeats(model: str) -> Card:
         20,
         "",
         command=f"ctxval run robots.double_pendulum:experiment --option folder=FOLDER --option model={model} "
-        f"--option seconds=1.5 --option repeats=true --threshold {SHARES[1] * largest:.3g} --kind suite",
+        f"--option seconds=1.5 --option repeats=true --threshold {SHARES[1] * largest:.3g}",
     )
 
 

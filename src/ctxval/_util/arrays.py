@@ -6,6 +6,7 @@ Small dense algebra is slower on many BLAS threads, and its last bits depend on 
 from __future__ import annotations
 
 import functools
+import importlib
 import math
 import reprlib
 from collections.abc import Callable
@@ -103,7 +104,10 @@ def rows_of(array: Array) -> Array:
     return array.reshape(math.prod(array.shape[:-1]), array.shape[-1])
 
 
-_thread_pools = functools.cache(ThreadpoolController)
+@functools.cache
+def _thread_pools() -> ThreadpoolController:
+    importlib.import_module("scipy.linalg")  # it has an algebra library of its own, which may not be loaded yet
+    return ThreadpoolController()
 
 
 def single_threaded() -> AbstractContextManager[Any]:

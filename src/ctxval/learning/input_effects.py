@@ -16,12 +16,13 @@ import scipy
 
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.model import Model
+from ctxval.core.state_geometry import geometry_of
 from ctxval.learning.effects.dictionary import kinds
 from ctxval.learning.effects.effect import EffectCandidate, Observed, OfInput
 from ctxval.learning.effects.inputs import InputEffects
 from ctxval.learning.effects.plant import Plant
 from ctxval.learning.effects.transport import Delay, Late
-from ctxval.learning.histories import History, Record, Structure
+from ctxval.learning.histories import Record
 from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior, Mode, learning_rows, log_posterior
 from ctxval.learning.residual_data import floors
 from ctxval.models.increments import standard_deviations
@@ -34,6 +35,7 @@ class InputEffectSettings:
     better: float = 0.3  # by which each effect must raise the log evidence per recorded value
     close: float = 0.1  # by which it may lower it before its sizes are refined
     most: int = 2  # effects
+    single: int = 4  # inputs up to which effects of single ones are tried: each has about 20 first guesses
     smooth: float = 20.0  # length-scale of inputs in their deviations, with which kinks are looked for first
     learned_from: int = 150  # transitions
     climbed: int = 4  # candidates whose hyperparameters are searched for
@@ -106,8 +108,8 @@ def found_effects(
 class _Search:
     """The evidence of effects of inputs."""
 
+    model: Model
     records_of: RecordsOf
-    history: History
     candidates: Found
     rows: Rows  # of the transitions that hyperparameters are learned from
     live: Mask  # which states have a residual that is no rounding
@@ -121,16 +123,14 @@ class _Search:
         cls, model: Model, records_of: RecordsOf, candidates: Found, evaluations: int, settings: InputEffectSettings
     ) -> _Search | None:
         """Return the search; None if M misses nothing."""
-        records = records_of(InputEffects())
-        history = History(model, Structure(0), np.eye(records[0].states.shape[1]))
-        Z, E, _ = history.along(records)
-        steps = np.concatenate([np.diff(each.states, axis=0) for each in records])
-        sizes, inputs = np.sqrt((E**2).mean(axis=0)), records[0].inputs.shape[-1]
-        live = sizes > floors(np.concatenate([each.states[1:] for each in records]), steps)
-        if not live.any():
+        X, U, Y = _transitions(records_of(InputEffects()))
+        (Z, E), inputs = _missed(model, X, U, Y), U.shape[1]
+        sizes = np.sqrt((E**2).mean(axis=0))
+        live = sizes > floors(Y, geometry_of(model).difference(Y, X))
+        if not live.any() or not np.isfinite(sizes).all():
             return None
         rows = learning_rows(_standardised(Z), inputs, settings.learned_from)
-        return cls(records_of, history, candidates, rows, live, sizes, inputs, evaluations, settings)
+        return cls(model, records_of, candidates, rows, live, sizes, inputs, evaluations, settings)
 
     @property
     def values(self) -> int:
@@ -139,8 +139,12 @@ class _Search:
 
     def data(self, effects: Found) -> tuple[Array, Array]:
         """Return states and acting inputs ``(N, n + m)``, and residuals over their sizes if commands act at once."""
-        Z, E, _ = self.history.along(self.records_of(InputEffects(tuple(each.effect for each in effects))))
-        return Z[self.rows], E[self.rows][:, self.live] / self.sizes[self.live]
+        records = self.records_of(InputEffects(tuple(each.effect for each in effects)))
+        X, U, Y = (part[self.rows] for part in _transitions(records))
+        Z, E = _missed(self.model, X, U, Y)
+        if not np.isfinite(E).all():
+            raise np.linalg.LinAlgError
+        return Z, E[:, self.live] / self.sizes[self.live]
 
     def mode(self, effects: Found) -> Mode:
         """Return the most probable hyperparameters with effects."""
@@ -212,6 +216,19 @@ class _Search:
         whole = np.where(are_delays, np.round(best), best)
         near = [(best, 0.5 * np.log(len(self.rows)) * sum(are_delays)), (whole, 0.0)]
         return _all_sized(effects, min(near, key=lambda pair: unlikely(pair[0]) + pair[1])[0][:-1])
+
+
+def _transitions(records: Sequence[Record]) -> tuple[Array, Array, Array]:
+    """Return states, acting inputs and next states of all steps, ``(N, n)``, ``(N, m)`` and ``(N, n)``."""
+    states = [each.states for each in records]
+    X, Y = np.concatenate([x[:-1] for x in states]), np.concatenate([x[1:] for x in states])
+    return X, np.concatenate([each.inputs for each in records]), Y
+
+
+def _missed(model: Model, X: Array, U: Array, Y: Array) -> tuple[Array, Array]:
+    """Return states and inputs as regressors ``(N, k)``, and what M misses of the next states ``(N, n)``."""
+    geometry = geometry_of(model)
+    return np.concatenate([geometry.features(X), U], axis=1), geometry.missed(Y, np.asarray(model.step(X, U)), X)
 
 
 def _standardised(Z: Array) -> Array:

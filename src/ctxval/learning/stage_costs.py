@@ -243,7 +243,9 @@ class Costs:
 
     def input_effects(self) -> float:
         """Return the seconds of a search for effects of inputs, such as a delay."""
-        return self._own(self._density() * (4 * 140 + 2 * 80 + 10))
+        m = self.sizes.inputs
+        guesses = 10 + (18 * m if m <= 4 else 0)  # of effects of single inputs
+        return self._own(self._density() * (4 * 140 + 2 * 80 + guesses))
 
     def friction(self) -> float:
         """Return the seconds of a search for dry friction, and of learning with it."""

@@ -181,8 +181,9 @@ class StructureSearch:
         # If states are recorded, they are the same with all effects.
         plain = [] if estimated else estimated_with(InputEffects())
         model = before_refinement(study.validation.model)
-        # If states have to be estimated each time, single inputs cost too much.
-        candidates = study.input_candidates([trajectory for _, trajectory in among], together=estimated)
+        # If states have to be estimated each time, or with many inputs, single ones cost too much.
+        together = estimated or commanded[0].shape[-1] > self.settings.input_effects.single
+        candidates = study.input_candidates([trajectory for _, trajectory in among], together=together)
         with single_threaded(), np.errstate(all="ignore"):
             found = found_effects(
                 model, estimated_with if estimated else with_inputs, candidates, before,
