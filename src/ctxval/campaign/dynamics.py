@@ -288,15 +288,15 @@ class CampaignDynamics:
         names, part = len(self.study.given.space.units) + 1, "the parameter that the dynamics seem to depend on"
         asks = evidence.failed is not None
         asks = asks and ledger.optional("learning", part, lambda costs: names * costs.learning())
-        influential, executed = learned.influential, executed_trials(self._store, trials)
-        known_executions = [(trial.unit_point, trajectory) for trial, trajectory in executed]
+        influential, study = learned.influential, learned.study
+        executed = at_points(executed_trials(self._store, trials)) if asks else []
         evidence = replace(
             evidence,
             executed=self._explained(learned, trials),
             influential=None if influential is None else tuple(influential.tolist()),
             drift=learned.drift,
             uneven=learned.uneven_friction,
-            suspect=learned.study.suspected_parameter(learned, known_executions) if asks else None,
+            suspect=study.suspected_parameter(learned, executed) if asks else None,
         )
         # How many tests a verdict needs is not known here. Negligible errors are no function to search, nor to push.
         if evidence.negligible or is_open(evidence, "learning", "coverage", "tested", "explained", "search"):

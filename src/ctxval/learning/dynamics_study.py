@@ -222,15 +222,16 @@ class DynamicsStudy(ShortRepr):
         loops, on_model, settings = [trajectory for _, trajectory in executed], self.extended.loops, self.settings
         if on_model is None:
             return None
-        candidates, count = self.input_candidates(loops, together=True), scheduled(len(loops))
+        count = scheduled(len(loops))
         key = digest(loops[:count])
         posterior, seed = None, (self.seed, count, 0)
         if key not in self._effects_of:
+            candidates = self.input_candidates(loops, together=True)
             posterior = learned_parameters(model, loops[:count], on_model, seed, candidates, None, settings.parametric)
             self._effects_of[key] = () if posterior is None else posterior.effects
         if posterior is None or count < len(loops):
             seed, known = (self.seed, len(loops), 0), self._effects_of[key]
-            posterior = learned_parameters(model, loops, on_model, seed, candidates, known, settings.parametric)
+            posterior = learned_parameters(model, loops, on_model, seed, (), known, settings.parametric)
         if posterior is None:
             return None
         points = np.array([point for point, _ in executed])
@@ -394,8 +395,8 @@ class DynamicsStudy(ShortRepr):
         Each of the given executions is predicted from the others, with the parameter as a state and without it. Returns
         None if there are too few executions, or if no parameter halves the error.
         """
-        first, error, _ = self.settings.structure.parameter
-        if len(executed) < first or not learned.left_out_error > error:
+        limits = self.settings.structure.parameter
+        if len(executed) < limits.after or not learned.left_out_error > limits.error:
             return None
         found, with_it, without_it = most_telling(self, executed)
         if found is None or with_it > without_it / 2:

@@ -9,7 +9,7 @@ residual, with steps back.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -18,7 +18,7 @@ from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.model import Model
 from ctxval.core.state_geometry import geometry_of
 from ctxval.learning.effects.dictionary import kinds
-from ctxval.learning.effects.effect import EffectCandidate, Observed, OfInput
+from ctxval.learning.effects.effect import EffectCandidate, Observed, OfInput, all_sized
 from ctxval.learning.effects.inputs import InputEffects
 from ctxval.learning.effects.plant import Plant
 from ctxval.learning.effects.transport import Delay, Late
@@ -155,7 +155,7 @@ class _Search:
         """Return effects with the one more that explains most, and their mode; None if it explains too little."""
         kinds_of = {each.effect.kind for each in effects}
         tried = [
-            self._ordered((*effects, _sized(each, start)))
+            self._ordered((*effects, each.sized(start)))
             for each in self.candidates
             if each.effect.kind not in kinds_of
             for start in _starts(each)
@@ -201,7 +201,7 @@ class _Search:
         low, high, steps = (np.array([getattr(p, name) for p in parameters]) for name in ("low", "high", "scale"))
 
         def unlikely(values: Array) -> float:
-            Z, E = self.data(_all_sized(effects, np.clip(values[:-1], low, high)))
+            Z, E = self.data(all_sized(effects, np.clip(values[:-1], low, high).tolist()))
             return -log_posterior(mode.kernel, np.append(place[:-1], values[-1]), (Z - shift) / scale, E)[0]
 
         # The noise changes with the sizes: what wrong sizes leave is no smooth function.
@@ -215,7 +215,8 @@ class _Search:
         are_delays = [*(isinstance(each.effect, Delay) for each in effects for _ in each.parameters), False]
         whole = np.where(are_delays, np.round(best), best)
         near = [(best, 0.5 * np.log(len(self.rows)) * sum(are_delays)), (whole, 0.0)]
-        return _all_sized(effects, min(near, key=lambda pair: unlikely(pair[0]) + pair[1])[0][:-1])
+        likely, _ = min(near, key=lambda pair: unlikely(pair[0]) + pair[1])
+        return all_sized(effects, likely[:-1].tolist())
 
 
 def _transitions(records: Sequence[Record]) -> tuple[Array, Array, Array]:
@@ -240,12 +241,3 @@ def _starts(candidate: EffectCandidate) -> list[tuple[float, ...]]:
     if any(any(start) for start in candidate.starts):
         return list(candidate.starts)
     return [tuple(sign * 4 * parameter.scale for parameter in candidate.parameters) for sign in (-1, 1)]
-
-
-def _sized(candidate: EffectCandidate, sizes: Sequence[float]) -> EffectCandidate:
-    return replace(candidate, effect=candidate.effect.with_sizes(sizes))
-
-
-def _all_sized(effects: Found, sizes: Array) -> Found:
-    left = iter(sizes.tolist())
-    return tuple(_sized(each, [next(left) for _ in each.parameters]) for each in effects)

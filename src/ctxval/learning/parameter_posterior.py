@@ -253,7 +253,7 @@ def most_probable_effects(
     best, found = mode, tuple[EffectCandidate, ...]()
     while len(found) < settings.effects and best.left > settings.explained**2:
         tried = [
-            (*found, replace(each, effect=each.effect.with_sizes(start)))
+            (*found, each.sized(start))
             for each in candidates
             if each.effect.kind not in [other.effect.kind for other in found]
             for start in each.starts

@@ -241,10 +241,10 @@ class Costs:
         share = (self.sizes.centres / 400) ** 2
         return self._own(curvature + hyperparameters * self.thinking.settings.component * max(share, 0.1))
 
-    def input_effects(self) -> float:
-        """Return the seconds of a search for effects of inputs, such as a delay."""
+    def input_effects(self, single: int) -> float:
+        """Return the seconds of a search for effects of inputs, of single ones if there are at most so many."""
         m = self.sizes.inputs
-        guesses = 10 + (18 * m if m <= 4 else 0)  # of effects of single inputs
+        guesses = 10 + (18 * m if m <= single else 0)
         return self._own(self._density() * (4 * 140 + 2 * 80 + guesses))
 
     def friction(self) -> float:

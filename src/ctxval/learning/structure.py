@@ -33,19 +33,26 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+class PartLimits:
+    """When a part is looked for, and how much of the left-out errors it must explain; errors are shares of M's."""
+
+    after: int  # executions from which on it is looked for
+    error: float  # left-out error above which it is
+    share: float  # of this error that it must leave at most
+    most: float = np.inf  # left-out error that it must leave at most
+
+
+@dataclass(frozen=True)
 class StructureSettings:
     """When parts are looked for, and how much of the left-out errors each must explain.
 
     Errors are shares of those of M.
     """
 
-    #: of each part: executions from which on it is looked for, the left-out error above which it is, and the share of
-    #: this error that it must leave at most
-    inputs: tuple[int, float, float] = (3, 0.02, 0.95)  # the evidence decides
-    friction: tuple[int, float, float] = (4, 0.1, 0.5)
-    data: tuple[int, float, float] = (3, 0.1, 1 / 3)
-    parameter: tuple[int, float, float] = (6, 0.1, 1 / 3)
-    small: float = 0.1  # left-out error that data of M and a task parameter must leave at most
+    inputs: PartLimits = PartLimits(3, 0.02, 0.95)  # the evidence decides
+    friction: PartLimits = PartLimits(4, 0.1, 0.5)
+    data: PartLimits = PartLimits(3, 0.1, 1 / 3, 0.1)
+    parameter: PartLimits = PartLimits(6, 0.1, 1 / 3, 0.1)
     enough: float = 0.02  # left-out error below which no further part is compared
     kept: float = 2.0  # share of parts found before: single steps tell less of dry friction than loops do
     noise: float = 0.75  # largest share of the squares of errors that counts as noise
@@ -59,11 +66,10 @@ class Part:
     """A part that dynamics may have."""
 
     name: str  # as the budget of thinking names it
-    limits: tuple[int, float, float]  # see :class:`StructureSettings`
+    limits: PartLimits
     seconds: Callable[[Costs], float]
     add: Callable[[DynamicsStudy, Executed], DynamicsStudy | None]  # a study with it; None if it explains nothing
     has: Callable[[DynamicsStudy], bool]
-    most: float = np.inf  # left-out error that it must leave at most
 
 
 class StructureSearch:
@@ -72,27 +78,24 @@ class StructureSearch:
     def __init__(self, plain: DynamicsStudy, settings: StructureSettings) -> None:
         self.plain, self.settings = plain, settings
         self._known: dict[bytes, DynamicsStudy] = {}
-        names = len(plain.given.space.units) + 1
-        estimated, small = plain.given.outputs is not None, settings.small
-        parts = [
+        names, single = len(plain.given.space.units) + 1, settings.input_effects.single
+        friction = Part(
+            "dry friction", settings.friction, Costs.friction,
+            self.with_friction, lambda study: study.friction is not None,
+        )  # fmt: skip
+        self.parts = [
             Part(
-                "inputs that act late", settings.inputs, Costs.input_effects,
+                "inputs that act late", settings.inputs, lambda costs: costs.input_effects(single),
                 self.with_inputs, lambda study: bool(study.effects),
             ),
-            Part(
-                "dry friction", settings.friction, Costs.friction,
-                self.with_friction, lambda study: study.friction is not None,
-            ),
-            Part(
-                "the data of M", settings.data, Costs.learning, _without_data, lambda study: not study.with_data, small
-            ),
+            *([friction] if plain.given.outputs is None else []),
+            Part("the data of M", settings.data, Costs.learning, _without_data, lambda study: not study.with_data),
             Part(
                 "parameters that change the dynamics", settings.parameter, lambda costs: names * costs.learning(),
                 lambda study, executed: most_telling(study, executed)[0],
-                lambda study: len(study.given.physical) > len(plain.given.physical), small,
+                lambda study: len(study.given.physical) > len(plain.given.physical),
             ),
         ]  # fmt: skip
-        self.parts = [part for part in parts if not (estimated and part.name == "dry friction")]
 
     def best(self, executed: Executed, learned: LearnedDynamics, ledger: Ledger) -> LearnedDynamics:
         """Return what executions teach with the structure that they show, for what they teach without."""
@@ -100,12 +103,12 @@ class StructureSearch:
         asked = [
             part
             for part in self.parts
-            if count < part.limits[0]
-            or not learned.left_out_error > part.limits[1]
+            if count < part.limits.after
+            or not learned.left_out_error > part.limits.error
             or ledger.learns("learning", part.name, part.seconds)
         ]
         study, key_of_parts = self.plain, bytes(part in asked for part in self.parts)
-        for some in (executed[:number] for number in schedule(min(part.limits[0] for part in self.parts), count)):
+        for some in (executed[:number] for number in schedule(min(part.limits.after for part in self.parts), count)):
             key = digest(trajectory for _, trajectory in some) + key_of_parts
             if key not in self._known:
                 self._known[key] = study  # also if the search fails
@@ -127,15 +130,15 @@ class StructureSearch:
             if learned is None:
                 break
             for part in asked:
-                first, error, share = part.limits
-                if part.has(study) or len(executed) < first or not learned.left_out_error > error:
+                limits = part.limits
+                if part.has(study) or len(executed) < limits.after or not learned.left_out_error > limits.error:
                     continue
                 tried = part.add(study, executed)
                 found = None if tried is None else tried.learned_alone(executed)
                 if found is None:
                     continue
                 left = share_left(found, learned, self.settings)
-                if left < share and found.left_out_error < part.most and (best is None or left < best[0]):
+                if left < limits.share and found.left_out_error < limits.most and (best is None or left < best[0]):
                     best = left, found
                     if found.left_out_error < self.settings.enough:
                         break

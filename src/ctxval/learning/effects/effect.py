@@ -155,6 +155,16 @@ class EffectCandidate(ShortRepr):
     parameters: tuple[Parameter, ...] = ()  #: one for each size
     starts: tuple[tuple[float, ...], ...] = ((),)  #: first guesses of all sizes
 
+    def sized(self, sizes: Sequence[Size]) -> EffectCandidate:
+        """Return the candidate with an effect of these sizes."""
+        return replace(self, effect=self.effect.with_sizes(sizes))
+
+
+def all_sized(candidates: Iterable[EffectCandidate], sizes: Iterable[Size]) -> tuple[EffectCandidate, ...]:
+    """Return candidates with effects of these sizes, one for each parameter of all of them in their order."""
+    left = iter(sizes)
+    return tuple(each.sized([next(left) for _ in each.parameters]) for each in candidates)
+
 
 def of_size(effect: Effect, parameter: Parameter, *starts: float) -> EffectCandidate:
     """Return a candidate with one size."""

@@ -14,7 +14,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.state_geometry import geometry_of
 from ctxval.core.trajectory import Trajectory
-from ctxval.learning.effects.effect import Effect, EffectCandidate
+from ctxval.learning.effects.effect import Effect, EffectCandidate, all_sized
 from ctxval.learning.effects.flow import Linearisation
 from ctxval.learning.effects.model import ModelWithEffects
 from ctxval.models import MuJoCo
@@ -270,9 +270,9 @@ class _Fit:
 
     def repaired(self, theta: Array) -> ModelWithEffects:
         """Return M with effects of sizes ``(p,)``, or with those of draws ``(S, p)``."""
-        sizes = iter(theta.tolist() if theta.ndim == 1 else theta.T[:, :, None])
-        effects = (each.effect.with_sizes([next(sizes) for _ in each.parameters]) for each in self.candidates)
-        return ModelWithEffects(self.segments.model, tuple(effects), self.segments.inputs.shape[-1])
+        sized = all_sized(self.candidates, theta.tolist() if theta.ndim == 1 else theta.T[:, :, None])
+        effects = tuple(each.effect for each in sized)
+        return ModelWithEffects(self.segments.model, effects, self.segments.inputs.shape[-1])
 
     def errors(self, theta: Array, sizes: Sequence[Array]) -> Array:
         """Return residuals ``(R,)`` in given sizes, or ``(S, R)``; their squares are means over each window."""

@@ -9,7 +9,6 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
-from ctxval._util.texts import parted
 from ctxval.learning.effects.effect import Effect, EffectCandidate, OfInput
 
 
@@ -49,7 +48,7 @@ def labelled_sizes(found: tuple[EffectCandidate, ...], inputs: list[tuple[str, s
     sizes = {}
     for each in found:
         effect = each.effect
-        of = f" of {parted(inputs[effect.input][0])[0]}" if isinstance(effect, OfInput) else ""
+        of = f" of {inputs[effect.input][0]}" if isinstance(effect, OfInput) else ""
         for parameter, size in zip(each.parameters, effect.sizes, strict=True):
             unit = f" [{parameter.unit}]" if parameter.unit else ""
             sizes[f"{parameter.name}{of}{unit}"] = float(size)

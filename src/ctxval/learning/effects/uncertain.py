@@ -9,7 +9,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.uncertain import UncertainModel, UncertainParameter
-from ctxval.learning.effects.effect import EffectCandidate
+from ctxval.learning.effects.effect import EffectCandidate, all_sized
 from ctxval.learning.effects.model import ModelWithEffects
 
 
@@ -37,8 +37,8 @@ class UncertainEffects(ShortRepr):
     def drawn(self, z: Array) -> Model:
         """Return S models with standardised parameters ``(S, K)``; see :class:`UncertainModel`."""
         of_model = len(self.given.uncertain)
-        sizes = iter(each.at(z[:, k, None]) for k, each in enumerate(self.uncertain) if k >= of_model)
-        effects = tuple(each.effect.with_sizes([next(sizes) for _ in each.parameters]) for each in self.effects)
+        sizes = (each.at(z[:, k, None]) for k, each in enumerate(self.uncertain) if k >= of_model)
+        effects = tuple(each.effect for each in all_sized(self.effects, sizes))
         return ModelWithEffects(self.given.drawn(z[:, :of_model]), effects, self.inputs)
 
     @functools.cached_property

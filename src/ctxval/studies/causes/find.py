@@ -321,10 +321,9 @@ class _Study:
         # What comes to less than a quarter of the evidence of the best one is not worth a fit.
         worth = [result for result in results[: self.settings.fitted] if result[0] <= 0.25 * results[0][0]]
         refined = [explained(self.segments, together, begun) for _, begun, together in worth or results[:1]]
-        refined += [
-            explained(self.segments, (*self.known, *beside, each), screened(self.some, (*self.known, *beside, each))[1])
-            for each in self._simpler(min(refined, key=lambda each: each.criterion))
-        ]
+        for each in self._simpler(min(refined, key=lambda each: each.criterion)):
+            together = (*self.known, *beside, each)
+            refined.append(explained(self.segments, together, screened(self.some, together)[1]))
         distinct = list[Explanation]()
         for explanation in sorted(refined, key=lambda each: each.criterion):
             if not any(_is_same(explanation, other) for other in distinct):
@@ -341,9 +340,9 @@ class _Study:
         return [
             each
             for each in self.dictionary
-            if len(each.parameters) < len(last.parameters)
-            and getattr(each.effect, "joint", joint) == joint
-            and isinstance(each.effect, Force)
+            if isinstance(each.effect, Force)
+            and each.effect.joint == joint
+            and len(each.parameters) < len(last.parameters)
         ]
 
     def _chosen(self, ranked: list[Explanation]) -> tuple[Explained | None, list[Explained]]:
