@@ -147,7 +147,9 @@ def logarithm(J: Array) -> Array:
     far = np.flatnonzero(~near)
     if len(far):
         eigenvalues = np.linalg.eigvals(rows[far])
-        without = ((eigenvalues.real < 1e-9) & (np.abs(eigenvalues.imag) < 1e-9)).any(axis=-1)
+        # Rounding errors of the largest eigenvalue hide the sign of smaller ones.
+        least = np.maximum(1e-9, 8 * np.finfo(np.float64).eps * np.abs(eigenvalues).max(axis=-1, keepdims=True))
+        without = ((eigenvalues.real < least) & (np.abs(eigenvalues.imag) < least)).any(axis=-1)
         far = far[~without]
         result[far] = _by_roots(rows[far])
     result[near] = _by_series(ratio[near])
