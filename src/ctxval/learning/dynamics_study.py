@@ -35,7 +35,7 @@ from ctxval.learning.regular import RegularSettings, split_transitions
 from ctxval.learning.share_search import ShareSearch
 from ctxval.learning.stage_costs import Costs, Ledger, ThinkingSettings, reduced
 from ctxval.learning.structure import StructureSearch, StructureSettings, most_telling
-from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
+from ctxval.learning.worst_case import SuiteSearch, WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
 
@@ -145,16 +145,17 @@ class DynamicsStudy(ShortRepr):
     @functools.cached_property
     def search(self) -> WorstCaseSearch:
         """Searches the tasks for the largest distance of each draw."""
-        settings = WorstCaseSettings.for_dimension(self.validation.space.dimension, self.planner.batched)
+        settings = WorstCaseSettings.for_space(self.validation.space, self.planner.batched)
         if self.share < 1:
             return ShareSearch(self.planner, self.seed, self.share, settings)
-        return WorstCaseSearch(self.planner, self.seed, settings)
+        of_largest = WorstCaseSearch if self.validation.space.members is None else SuiteSearch
+        return of_largest(self.planner, self.seed, settings)
 
     def search_within(self, ledger: Ledger, replicates: int) -> WorstCaseSearch:
         """Return the search, of fewer tasks if the budget of a ledger does not allow all of them."""
-        if not ledger.is_limited or self.share < 1:  # fewer tasks tell nothing of a share of them
+        if not ledger.is_limited or not self.search.settings.reducible:
             return self.search
-        shares = self.settings.thinking.shares if self.search.members is None else (1.0,)
+        shares = self.settings.thinking.shares
         for share in shares:
             settings = reduced(self.search.settings, share) if share < 1 else self.search.settings
 
