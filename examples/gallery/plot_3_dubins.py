@@ -17,10 +17,10 @@ print(campaign.worst.parameters, campaign.worst.distance)
 
 # %%
 # With eleven parameters the convergence is the most informative plot.
-distances = campaign.completed.distances
+distances = campaign.trials.completed.distances
 figure, axes = pyplot.subplots(layout="constrained")
-axes.step(campaign.completed.numbers, np.maximum.accumulate(distances), where="post")
-axes.plot(campaign.completed.numbers, distances, "ko")
+axes.step(campaign.trials.completed.numbers, np.maximum.accumulate(distances), where="post")
+axes.plot(campaign.trials.completed.numbers, distances, "ko")
 axes.set(xlabel="trial", ylabel="distance")
 pyplot.show()
 

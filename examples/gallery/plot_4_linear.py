@@ -18,10 +18,10 @@ print(f"largest distance found {campaign.worst.distance:.4f}, d* = {truth.distan
 
 # %%
 # The line is the true d*.
-distances = campaign.completed.distances
+distances = campaign.trials.completed.distances
 figure, axes = pyplot.subplots(layout="constrained")
-axes.step(campaign.completed.numbers, np.maximum.accumulate(distances), where="post")
-axes.plot(campaign.completed.numbers, distances, "ko")
+axes.step(campaign.trials.completed.numbers, np.maximum.accumulate(distances), where="post")
+axes.plot(campaign.trials.completed.numbers, distances, "ko")
 axes.axhline(truth.distance, linestyle=":")
 axes.set(xlabel="trial", ylabel="distance")
 pyplot.show()
