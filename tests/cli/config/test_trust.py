@@ -384,32 +384,6 @@ def test_what_the_user_names_may_be_of_an_installed_package(site: Path) -> None:
     done("ask", "a.sqlite")
 
 
-def test_cases_of_installed_packages_are_listed_with_their_options(site: Path) -> None:
-    said = done("cases").stdout
-    assert_names(said, "swing", "pendulum", "size", "options")
-    assert json.loads(done("cases", "swing", "--json").stdout)["options"] == {"size": 1}
-    assert "case 'swing': size" in refusal("run", "swing", "--option", "size=large")
-    (site / "their_parts.py").write_text("1 / 0")
-    sys.modules.pop("their_parts")
-    assert_names(" ".join(done("cases").stdout.split()), "their_parts:swing", "ZeroDivisionError")
-    assert "pendulum" in done("cases").stdout
-    refusal("cases", "swing")
-
-
-@pytest.mark.parametrize(
-    ("code", "facts"),
-    [
-        ("swing = dict", ("swing",)),
-        ("def swing(seed, size: '1 / 0' = 2): ...", ("size", 2)),
-    ],
-)
-def test_a_case_that_cannot_be_inspected_hides_no_other_one(code: str, facts: tuple[object, ...], site: Path) -> None:
-    (site / "their_parts.py").write_text(code)
-    listed = " ".join(done("cases").stdout.split())
-    assert_names(listed, *facts)
-    assert "pendulum" in listed
-
-
 # Naming the experiment again
 
 
