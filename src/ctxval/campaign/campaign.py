@@ -506,9 +506,8 @@ class Campaign:
 
     @property
     def estimate(self) -> float | None:
-        """The search's estimate of d*: the largest distance, unless the search discards some (SD) or repeats its tasks.
+        """The search's estimate of d*: the largest distance, unless the search discards some (SD).
 
-        If the search repeats its tasks, the estimate is the largest mean distance of a task with all its repetitions.
         It is None if there are too few distances.
         """
         return self.recorder.search.estimate(*self._distances())

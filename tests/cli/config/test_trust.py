@@ -156,7 +156,7 @@ ATTACKS: dict[str, dict[str, Any]] = {
     "environment": {**PLAIN, "system": {"type": "Gymnasium", "environment": "evil:Environment-v0"}},
     "fmu": {**PLAIN, "system": {"type": "FMU", "source": "evil.fmu", "states": {"x": ""}, "inputs": {"u": ""}}},
     "installed distance": {**PLAIN, "distance": {"type": "Speed"}},
-    "installed search": {**PLAIN, "search": {"type": "corners", "repeats": 1}},
+    "installed search": {**PLAIN, "search": {"type": "corners"}},
     "installed case": {"experiment": "swing"},
     "folder": {**PLAIN, "task": {"ref": "evil:task"}, "folder": "."},
     "deep": {**PLAIN, "system": {"type": "Simulated", "step": [[{"a": [{"ref": "evil:step"}]}]]}},
@@ -379,7 +379,7 @@ def test_what_the_user_names_may_be_of_an_installed_package(site: Path) -> None:
     done("ask", "a.sqlite")  # it is the user's own store
     shutil.rmtree(allowed_folder())
     said = refusal("ask", "a.sqlite")  # it is not any more
-    assert "distance = {'type': 'Speed'}; search = {'repeats': 1, 'type': 'corners'}" in said
+    assert "distance = {'type': 'Speed'}; search = {'type': 'corners'}" in said
     done("ask", "a.sqlite", "--trust")
     done("ask", "a.sqlite")
 
