@@ -139,9 +139,8 @@ class EnvelopeSearch:
         if learned is None or learned.posterior.noise > LIMITS.noise:
             return None
         without = learned.posterior.covariances.without_model
-        return learned, replace(
-            evidence, target=LARGEST_DISTANCE, lags=0, noise=learned.posterior.noise, without_model=without
-        )
+        noise = learned.posterior.noise
+        return learned, replace(evidence, target=LARGEST_DISTANCE, lags=0, noise=noise, without_model=without)
 
     def _left_out(self, learned: LearnedDynamics, evidence: Evidence) -> Evidence:
         """Return evidence with the tests alone, each predicted from all executions of other tasks.

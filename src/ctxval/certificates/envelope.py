@@ -99,9 +99,8 @@ class Envelope(ShortRepr):
     #: executions, tests: numbers of executions, and of those that were predicted beforehand at drawn tasks
     executions: int = 0
     tests: int = 0
-    target: Target = (
-        LARGEST_DISTANCE  #: what stays below the threshold on each task: d itself, or its quantile under noise
-    )
+    #: what stays below the threshold on each task: the distance, or its quantile under noise
+    target: Target = LARGEST_DISTANCE
     assumptions: tuple[str, ...] = ()  #: what it assumes
     #: the number of recorded steps, such as contacts, that are no part of what is learned; a task is not trusted if its
     #: run comes to states like theirs
