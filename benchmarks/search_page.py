@@ -20,7 +20,7 @@ import study_global_search
 from ctxval._util.arrays import Array
 from json_lines import JsonLines
 from landed import LANDED
-from page_tables import DOCS, GeneratedPage, Table, reflowed, table
+from page_tables import DOCS, GeneratedPage, Table, included, reflowed, table
 from peers import run
 from peers.page import first_within as within_of
 from reproduce.jobs import AUTO, measured_with
@@ -117,18 +117,11 @@ def targets() -> list[Target]:
 
 
 TARGETS = ["case", "within", "target", "median", "25 to 75 %", "worst seed", "reached", "CPU s", "met"]
-LEFT_TO_THE_TABLE = {f"linear-{n}" for n in (2, 3, 4, 6, 7, 8, 9)}
-"""Cases of which the page shows no rows."""
 
 
-def target_rows(*, short: bool) -> list[list[str]]:
-    """Return the targets and the measured executions; ``short`` without some linear systems and columns."""
-    if not short:
-        return [row for target in targets() if (row := target.row())]
-    shown_targets = [
-        target for target in targets() if target.case not in LEFT_TO_THE_TABLE and not target.asked.endswith("30")
-    ]
-    return [[*row[:5], row[5].split(" (")[0], row[8]] for target in shown_targets if (row := target.row())]
+def target_rows() -> list[list[str]]:
+    """Return the targets and the measured executions."""
+    return [row for target in targets() if (row := target.row())]
 
 
 def heavy_tail() -> str:
@@ -356,8 +349,6 @@ the best value of a large search. `> 30` means that the campaign was not that ne
 
 {targets}
 
-All cases, with CPU seconds for each suggestion: [table](tables/searches-targets.csv).
-
 - {heavy_tail}
 - `scalar`, which sees no trajectory, with more seeds: {more_seeds}. To 1 % on linear, 20-D, it needs {scalar_alone}:
   it is a Bayesian optimisation like [others](benchmarks.md).
@@ -438,7 +429,7 @@ cases](tables/searches-global.csv). {surpassed}
 
 def page() -> GeneratedPage:
     """Return the page and its tables."""
-    rows = target_rows(short=False)
+    rows = target_rows()
     versions = search_versions_part.rows()
     fewer, more = search_versions_part.total()
     plants, plants_tables = search_plants_part.part()
@@ -448,7 +439,7 @@ def page() -> GeneratedPage:
         measured=measured_with(results_of("auto").values(), AUTO),
         met=sum(row[-1] == "yes" for row in rows),
         asked=len(rows),
-        targets=table([*TARGETS[:6], TARGETS[8]], target_rows(short=True)),
+        targets=included("searches-targets"),
         heavy_tail=heavy_tail(),
         more_seeds=more_seeds(),
         scalar_alone=scalar_alone(),
