@@ -297,7 +297,7 @@ class Campaign:
             self.state_threshold(threshold)
         predicts = decides is not None and decides.predicts
         with self.recorder.predicting(predicts, thinking), progress_shown(progress):
-            if predicts and not self.trials and options.kind.share == 1:
+            if predicts and not self.trials and not options.kind.target.by_draws:
                 self.recorder.dynamics.find_sensitivity(threshold)
             ExecutionLoop(
                 self.recorder,
@@ -536,10 +536,8 @@ class Campaign:
         If an executed distance falsifies the threshold, the verdict needs nothing, and nothing is computed.
         """
         known, judged = self.provenance, self.recorder.trials if trials is None else trials
-        kind, confidence = options.kind, options.confidence
-        if threshold is not None and counterexample(
-            judged, threshold, known.quantities, confidence, kind.quantile, kind.share
-        ):
+        confidence, target = options.confidence, options.kind.target
+        if threshold is not None and counterexample(judged, threshold, known.quantities, confidence, target):
             return known
         return replaced(known, learned=self.recorder.dynamics.learned_for(judged, options))
 
