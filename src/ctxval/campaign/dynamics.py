@@ -36,7 +36,7 @@ from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.coverage import unsampled_corner
 from ctxval.learning.prediction import Executed
 from ctxval.learning.sensitivity import Sensitivity, found_sensitivity
-from ctxval.learning.stage_costs import Costs, Ledger
+from ctxval.learning.stage_costs import Ledger
 from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
@@ -127,10 +127,11 @@ class CampaignDynamics:
         """Return whether the budget of the choice after trials allows no closed loops; nothing is learned."""
         return self.thinking.ledger(trials, len(executed_trials(self._store, trials))).spent_up
 
-    def affords(self, trials: Sequence[Trial], cost: Callable[[Costs], float]) -> bool:
+    def affords(self, trials: Sequence[Trial], loops: int) -> bool:
         """Return whether loops on what trials teach fit into a budget of their own, beside that of learning it."""
         ledger = self.ledger(trials)
-        return ledger.costs is None or ledger.seconds("loops", cost) <= ledger.costs.thinking.seconds
+        seconds = ledger.seconds("loops", lambda costs: costs.plan(loops) + costs.run(1, loops))
+        return ledger.costs is None or seconds <= ledger.costs.thinking.seconds
 
     def note(self, trials: Sequence[Trial]) -> dict[str, Any]:
         """Return what the next trial stores of the thinking on its task; empty without a budget."""

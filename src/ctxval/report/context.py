@@ -252,8 +252,7 @@ class ReportContext(ShortRepr):
         # Designs that cannot be made in a batch take long.
         points = [pair.trial.unit_point for pair in self.recordings.values()][: 120 if self.batched else 40]
         with stage("replaying executed tasks", len(points), "tasks"), self.thinks() as dynamics:
-            affords = dynamics.affords(self.trials, lambda costs: costs.plan(len(points)) + costs.run(1, len(points)))
-            learned = dynamics.learned(self.trials) if affords else None
+            learned = dynamics.learned(self.trials) if dynamics.affords(self.trials, len(points)) else None
             replays = replay_executed(self.validation, learned, points)
         return {k: replay for k, replay in zip(self.recordings, replays, strict=False) if replay is not None}
 
