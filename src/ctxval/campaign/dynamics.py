@@ -283,7 +283,7 @@ class CampaignDynamics:
             [self._allowed(trials), *((trial.number, trial.state, trial.distance, trial.note) for trial in trials)]
         )
         physical = "".join(f"{name} " for name in self.study.given.physical)
-        return f"evidence {confidence} {self.study.target.key} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
+        return f"evidence {confidence} {self.study.target} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
     def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float, ledger: Ledger) -> Evidence:
         draws, drawn_from = draws_for(confidence), learned.drawn_from
