@@ -30,7 +30,7 @@ from ctxval.learning.noise_study import NoiseSettings, NoiseStudy
 from ctxval.learning.parametric_dynamics import ParametricDynamics, ParametricSettings, learned_parameters
 from ctxval.learning.precision import AgreeingDynamics, AgreementSettings, agreeing_posterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
-from ctxval.learning.recorded import data_near, digest, recorded_transitions, scheduled
+from ctxval.learning.recorded import Memories, data_near, digest, recorded_transitions, scheduled
 from ctxval.learning.regular import RegularSettings, split_transitions
 from ctxval.learning.share_search import ShareSearch
 from ctxval.learning.stage_costs import Costs, Ledger, ThinkingSettings, reduced
@@ -80,8 +80,9 @@ class DynamicsStudy(ShortRepr):
         effects: Found = (),
         friction: DryFriction | None = None,
         with_data: bool = True,
+        memories: Memories | None = None,
     ) -> None:
-        self.settings = settings or LearningSettings()
+        self.settings, self.memories = settings or LearningSettings(), memories or Memories()
         self.given, self.seed, self.target = validation, seed, target
         self.effects, self.friction, self.with_data = effects, friction, with_data
         of_inputs = InputEffects(tuple(each.effect for each in effects))
@@ -120,7 +121,7 @@ class DynamicsStudy(ShortRepr):
             extended = same if effects is None else None
             self._made[key] = DynamicsStudy(
                 given, self.seed, self.target, extended, self.settings,
-                effects=kept, friction=friction, with_data=with_data,
+                effects=kept, friction=friction, with_data=with_data, memories=self.memories,
             )  # fmt: skip
         return self._made[key]
 
@@ -151,7 +152,7 @@ class DynamicsStudy(ShortRepr):
         """Return the search, of fewer tasks if the budget of a ledger does not allow all of them."""
         if not ledger.is_limited or not self.search.settings.reducible:
             return self.search
-        shares = self.settings.thinking.shares
+        shares, ledger.owed = self.settings.thinking.shares, 0.0
         for share in shares:
             settings = reduced(self.search.settings, share) if share < 1 else self.search.settings
 
@@ -372,7 +373,9 @@ class DynamicsStudy(ShortRepr):
         # The data that M was made from tell no earlier inputs.
         data = self._data if with_data and not self.effects else None
         loops = [loop for _, loop in executed]
-        return recorded_transitions(self.validation.model, data, loops, self.extended.loops, logged)
+        return recorded_transitions(
+            self.validation.model, data, loops, self.extended.loops, logged, memories=self.memories
+        )
 
     def input_candidates(self, loops: Sequence[Trajectory], *, together: bool) -> Found:
         """Return the effects that inputs may have in executions, alone or only those of all inputs ``together``."""
