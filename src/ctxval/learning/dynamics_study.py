@@ -21,12 +21,19 @@ from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.closed_loops import LoopPlanner, unseen_parameters
 from ctxval.learning.dry_friction import DryFriction
-from ctxval.learning.dynamics_posterior import LearnedCovariances, PosteriorSettings, condition, learn_covariances
+from ctxval.learning.dynamics_posterior import (
+    DynamicsPosterior,
+    LearnedCovariances,
+    PosteriorSettings,
+    condition,
+    learn_covariances,
+)
 from ctxval.learning.effects.inputs import InputEffects
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.input_effects import Found, input_candidates
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import NoiseSettings, NoiseStudy
+from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.parametric_dynamics import ParametricDynamics, ParametricSettings, learned_parameters
 from ctxval.learning.precision import AgreeingDynamics, AgreementSettings, agreeing_posterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
@@ -326,8 +333,31 @@ class DynamicsStudy(ShortRepr):
         loops = [trajectory for _, trajectory in executed]
         return LearnedDynamics(
             self, posterior, points, loops, with_data, ledger=Ledger() if ledger is None else ledger,
-            learn_noisy=lambda ledger: self.noise.learn(posterior, self.extended.records(executed), ledger),
+            learn_noisy=lambda ledger: self._noisy(posterior, executed, ledger),
         )  # fmt: skip
+
+    def _noisy(self, posterior: DynamicsPosterior, executed: Executed, ledger: Ledger) -> NoisyPosterior | None:
+        """Return dynamics with noise and histories; None without any, or if their closed loops contradict executions.
+
+        Along each record, earlier errors of M tell the next one even if it is a function of state and input that few
+        records show. In closed loops, errors that such a history makes itself tell nothing, and loops may diverge.
+        """
+        noisy, settings = self.noise.learn(posterior, self.extended.records(executed), ledger), self.settings.noise
+        if noisy is None or noisy.noise > settings.exact:
+            return noisy
+        pool = self.search.pool[: settings.batched_pool if self.planner.batched else settings.pool]
+        points = np.array([*(point for point, _ in executed), *pool])
+        planned = self.planner.plan(points)
+        with single_threaded(), np.errstate(all="ignore"):
+            without, with_it = (
+                np.nan_to_num(self.planner.distances(each.mean, planned, len(points))[0], nan=np.inf)
+                for each in (posterior, noisy)
+            )
+        at_executed = slice(len(executed))
+        largest = without[at_executed].max()
+        reproduced = np.abs(with_it - without)[at_executed].max() <= settings.reproduced * largest
+        converges = with_it.max() <= settings.diverged * without.max()
+        return noisy if (reproduced and converges) or not np.isfinite(without).all() else None
 
     @functools.cached_property
     def noise(self) -> NoiseStudy:
