@@ -11,7 +11,7 @@ export OMP_NUM_THREADS = 1
 unexport PYTHONDONTWRITEBYTECODE
 PIP := -m pip install --quiet --disable-pip-version-check --no-compile
 
-.PHONY: demo test suite quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine frozen reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo robots watch envelope friction safety share causes dist clean
+.PHONY: demo test suite quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine frozen reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo robots watch envelope friction safety simulated-robots causes dist clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -127,8 +127,8 @@ envelope: .venv/.test  ## which part of the true set envelopes find; writes docs
 friction: .venv/.test  ## how campaigns on systems with dry friction end; writes docs/dry-friction.md, and resumes
 	$(BIN)/python benchmarks/study_friction.py
 
-share: .venv/.test  ## verdicts on 99 % of the tasks; writes docs/how-to/share.md, and resumes
-	$(BIN)/python benchmarks/study_share.py
+simulated-robots: .venv/.test  ## verdicts and causes of robots in simulators; writes docs/simulated-robots.md, and resumes
+	$(BIN)/python benchmarks/study_simulated_robots.py
 
 causes: .venv/.test  ## does `ctxval why` name the fault of a robot? Writes docs/how-to/causes.md, and resumes
 	$(BIN)/python benchmarks/study_causes.py development

@@ -413,7 +413,7 @@ def _warm() -> None:
     import rosbags.rosbag2
     import rosbags.typesys
 
-    import ctxval.campaign.plot
+    import ctxval
     from ctxval.cli.commands import MODULES
 
     for module in MODULES.values():

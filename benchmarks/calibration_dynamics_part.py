@@ -13,7 +13,7 @@ import study_time_varying
 from calibrate_dynamics import BUDGETS, FALSE, GROUPS, RULE, STORED, TRUE, WITH_TESTS
 from calibration_verdicts_part import false_of
 from json_lines import JsonLines
-from page_tables import Table, table
+from page_tables import Table, included, table
 
 TEXT = """## Verdicts by learned dynamics
 
@@ -41,7 +41,7 @@ systems with an incomplete state, jumps or noise, {mislead_above} were validated
 - **The paper's cases** ({paper_seeds} seeds, at most {budget_paper} executions; the method was tried on them while
   it was written). {paper_compared}
 
-Tables: [reporting systems](tables/calibration-dynamics.csv), [by earlier
+Tables: [by earlier
 rules](tables/calibration-dynamics-earlier.csv), [false verdicts](tables/calibration-dynamics-false.csv), [without a
 threshold](tables/calibration-intervals.csv), [rough models](tables/calibration-rough.csv), [the paper's
 cases](tables/calibration-paper.csv).
@@ -85,10 +85,7 @@ def by_dynamics() -> tuple[str, dict[str, Table]]:
         earlier_95=false_of(_at(earlier, FALSE[0])),
         earlier_99=false_of(_at(earlier, FALSE[1])),
         misleading_95=false_of([one for one in _at(earlier, FALSE[0]) if _entry(one).misleading]),
-        present=table(
-            ["system", "tasks", "1.1 d*: validated", "executions"],
-            _short([one for one in present if not _entry(one).misleading]),
-        ),
+        present=included("calibration-dynamics"),
         mislead=len({one["entry"] for one in misleading}),
         mislead_above=_count(_at(misleading, TRUE[0]), "validated"),
         interval_seeds=study_interval.SEEDS,
@@ -172,15 +169,6 @@ def _entry(result: Result) -> Any:
 def _by_entry(results: list[Result]) -> list[tuple[str, list[Result]]]:
     names = dict.fromkeys(one["entry"] for one in results)
     return [(name, [one for one in results if one["entry"] == name]) for name in names]
-
-
-def _short(results: list[Result]) -> list[list[str]]:
-    """Return a row for each system: how many campaigns above d* were validated, and their executions."""
-    rows = []
-    for name, own in _by_entry(results):
-        above = _at(own, TRUE[0])
-        rows.append([name, f"{_entry(own[0]).dimensions()[0]}-D", _count(above, "validated"), _executions(above)])
-    return rows
 
 
 HEADER = [

@@ -10,7 +10,7 @@ import study_drawn_tests
 import study_ranked_coverage
 import study_tolerances
 from calibrate_strangers import BUDGET, ENTRIES, FALSE, HALVES, RULE, STORED
-from page_tables import Table, share_of, table
+from page_tables import Table, included, share_of, table
 from strangers_diagnostics import caught
 
 TEXT = """## Systems of strangers
@@ -24,8 +24,7 @@ and one end temperature absorb less heat. At 1.25 d*, {regular}.
 
 {families}
 
-Tables: [answers by family](tables/calibration-strangers.csv), [false
-validations](tables/calibration-strangers-false.csv).
+[False validations](tables/calibration-strangers-false.csv).
 
 ### Tests at drawn tasks
 
@@ -76,7 +75,7 @@ def of_strangers() -> tuple[str, dict[str, Table]]:
         false=false_of(results),
         false_systems="`, `".join(dict.fromkeys(line["entry"] for line in false)),
         regular=of_regular(results),
-        families=table(["family", *(f"{share:g} d*: {', '.join(KINDS)}" for share in (0.95, 1.25))], total(answers)),
+        families=included("calibration-strangers"),
         drawn=false_of_drawn(),
         power=table(
             ["system", "met", "validated", "falsified", "undecided", "median executions"],
@@ -88,7 +87,7 @@ def of_strangers() -> tuple[str, dict[str, Table]]:
         silent=", ".join(row[0] for row in diagnostics if row[2] == "0"),
     )
     return text, {
-        "calibration-strangers": (ANSWERS, answers),
+        "calibration-strangers": (ANSWERS, [*answers, total(answers)]),
         "calibration-strangers-false": (FALSE_HEADER, false_verdicts(false)),
         "calibration-drawn-tests": (
             ["system", *(f"{name}: met / failed" for name in study_drawn_tests.DESIGNS)],
@@ -162,15 +161,9 @@ def by_family(results: list[dict[str, Any]]) -> list[list[str]]:
     return rows
 
 
-def total(rows: list[list[str]]) -> list[list[str]]:
-    """Return the rows of families with a false or undecided verdict, and the sum of all families."""
-    sums = [f"all {len(rows)}", *(str(sum(int(row[k]) for row in rows)) for k in range(1, len(ANSWERS)))]
-    chosen = [row for row in rows if row[1] != "0" or row[3] != "0" or row[6] != "0"]
-    together = [[", ".join(row[1:4]), ", ".join(row[4:])] for row in (*chosen, sums)]
-    return [
-        [row[0], below, above if above != "0, 0, 0" else "-"]
-        for row, (below, above) in zip((*chosen, sums), together, strict=True)
-    ]
+def total(rows: list[list[str]]) -> list[str]:
+    """Return the sum of all families."""
+    return [f"all {len(rows)}", *(str(sum(int(row[k]) for row in rows)) for k in range(1, len(ANSWERS)))]
 
 
 def _met(row: list[str]) -> str:

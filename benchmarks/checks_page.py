@@ -1,14 +1,12 @@
-"""The table of checks in ``docs/theory.md``, from the table of the gate. Nothing is run here."""
+"""``docs/tables/checks.csv``: the checks of ``docs/theory.md``, from the table of the gate. Nothing is run here."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from ctxval.certificates.checks import CHECKS, Check
 from ctxval.certificates.limits import LIMITS
+from page_tables import DOCS, csv_text
 
-PAGE = Path(__file__).parents[1] / "docs" / "theory.md"
-BEGIN, END = "<!-- checks: begin -->\n", "<!-- checks: end -->"
+TABLE = DOCS / "tables" / "checks.csv"
 
 
 def limit_of(check: Check) -> str:
@@ -21,19 +19,11 @@ def limit_of(check: Check) -> str:
 
 def table() -> str:
     """Return the rows, in the order in which checks withdraw the bound and choose tasks."""
-    rows = ["| check | about | limit | an execution closes it | reason |", "|---|---|---|---|---|"]
-    for check in CHECKS:
-        remedy = "yes" if check.remedy else ""
-        rows.append(f"| `{check.code}` | {check.stage} | {limit_of(check)} | {remedy} | {check.reason} |")
-    return "\n".join(rows) + "\n"
-
-
-def page() -> str:
-    """Return the page with the present table."""
-    text = PAGE.read_text(encoding="utf-8")
-    first, last = text.index(BEGIN) + len(BEGIN), text.index(END)
-    return text[:first] + table() + text[last:]
+    rows = [
+        [f"`{each.code}`", each.stage, limit_of(each), "yes" if each.remedy else "", each.reason] for each in CHECKS
+    ]
+    return csv_text((["check", "about", "limit", "an execution closes it", "reason"], rows))
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    TABLE.write_text(table(), encoding="utf-8")

@@ -318,7 +318,10 @@ def call(campaign: Campaign, step: Sequence[Any], frozen: Mapping[str, Any], **o
 
 def search_of(frozen: Mapping[str, Any]) -> Any:
     """Return the search of a campaign; None for the default."""
-    return None if frozen["search"] is None else searches.by_name(**frozen["search"])
+    if frozen["search"] is None:
+        return None
+    options = dict(frozen["search"])
+    return searches.by_name(options.pop("name"), **options)
 
 
 def outcome(campaign: Campaign, frozen: Mapping[str, Any]) -> dict[str, Any]:

@@ -74,6 +74,11 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], "|" + "---|" * len(header), *lines[1:]])
 
 
+def included(name: str) -> str:
+    """Return what shows a file of ``docs/tables`` as a table of the manual, and a link to it for other readers."""
+    return f"```{{csv-table}}\n:file: tables/{name}.csv\n:header-rows: 1\n```\n\n([as a file](tables/{name}.csv))"
+
+
 def csv_text(table: Table) -> str:
     """Return a table as CSV."""
     text = io.StringIO()

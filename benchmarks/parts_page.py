@@ -9,7 +9,6 @@ from typing import Any
 
 from ctxval import cases, certificates, controllers, distances, models, searches, specs, systems
 from ctxval._util.registry import Declaration, Registry, declaration_of
-from ctxval.cli.config.parts import plain_options
 
 PAGE = Path(__file__).parents[1] / "docs" / "parts.md"
 
@@ -72,8 +71,8 @@ def _lines(section: Section) -> list[str]:
 def _row(registry: Registry, name: str) -> str:
     found = registry.find(name)
     if registry is cases.REGISTRY:
-        text, arguments = cases.text_of(name), ", ".join(_argument(*one) for one in plain_options(name).items())
-        return _cells(f"`{name}`", text, arguments)
+        plain = (one for one in cases.options_of(name).items() if one[0] not in ("settings", "pendulum"))  # objects
+        return _cells(f"`{name}`", cases.NAMES[name], ", ".join(_argument(*one) for one in plain))
     declared = declaration_of(found) or Declaration(name)
     text = registry.summary(name)
     arguments = _arguments(found, declared)

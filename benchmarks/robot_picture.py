@@ -21,7 +21,7 @@ import numpy as np
 from PIL import Image
 
 from ctxval import Campaign, Task, TaskSpace, Validation
-from study_parameters import cheetah, cheetah_mjcf
+from simulated_robots import ROBOTS, RUNNERS
 
 STORED = Path(__file__).parent / "results" / "robot.json"
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "robot.png"
@@ -40,7 +40,7 @@ def walk() -> Validation:
         return Task(x, command=p.points[..., :1], horizon=40, dt=0.05)
 
     space = TaskSpace(speed=(0.5, 2.5, "m/s"), pitch=(-0.2, 0.2, "rad"))
-    return cheetah("inside").with_parts(space=space, task=task)
+    return ROBOTS["cheetah"].make(ROBOTS["cheetah"].inside).with_parts(space=space, task=task)
 
 
 def run() -> dict[str, Any]:
@@ -67,7 +67,7 @@ def run() -> dict[str, Any]:
 
 def photograph(runs: dict[str, list[list[float]]], step: int) -> np.ndarray:
     """Return a picture of the robot at a time of the worst task, with its model as a pale robot."""
-    text = cheetah_mjcf()
+    text = RUNNERS["cheetah"].mjcf
     for old, new in (('reflectance="0.5"', 'reflectance="0"'), ('rgb1="0 0 0"', 'rgb1=".8 .8 .8"')):
         text = text.replace(old, new)
     model = mujoco.MjModel.from_xml_string(text.replace('rgb2="0.8 0.8 0.8"', 'rgb2=".95 .95 .95"'))

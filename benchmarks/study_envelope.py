@@ -24,7 +24,7 @@ from ctxval.core.quantiles import QUANTILE
 from dynamics_reporting import REPORTING as DYNAMICS
 from json_lines import JsonLines
 from noise_reporting import PLANTS
-from page_tables import GeneratedPage, reflowed, table
+from page_tables import GeneratedPage, included, reflowed
 from strangers_reporting import REPORTING as STRANGERS
 from study_auto import RESULTS
 
@@ -125,7 +125,7 @@ than 1 % of the tasks are falsely trusted (the goal is at most 5 % of 200 campai
   largest true distance of such a task, divided by the threshold.
 
 True sets are known at {tasks} random tasks, of noisy systems at {noisy_tasks} tasks with {repeats} executions each.
-On {nothing}, half of the campaigns or more found nothing. [All columns](tables/envelope.csv), [why no envelope was
+On {nothing}, half of the campaigns or more found nothing. [Why no envelope was
 stated](tables/envelope-refused.csv).
 
 ## How the method was chosen
@@ -184,9 +184,6 @@ def page() -> GeneratedPage:
         )
     false = np.array([line["false"] for line in results])
     reasons = [[line["system"], str(line["seed"]), line["doubt"]] for line in results if line["doubt"]]
-    columns = [
-        HEADER.index(name) for name in ("system", "parameters", "campaigns", "found", "in words", "false", "at most")
-    ]
     text = TEXT.format(
         count=len(results),
         budget=BUDGET,
@@ -203,7 +200,7 @@ def page() -> GeneratedPage:
         withdrawn=len(reasons),
         version=RULE,
         nothing="; ".join(system for system, median in medians.items() if median == 0),
-        short=table([HEADER[k] for k in columns], [[row[k] for k in columns] for row in rows]),
+        short=included("envelope"),
     )
     tables = {"envelope": (HEADER, rows), "envelope-refused": (["system", "seed", "reason"], reasons)}
     return GeneratedPage("envelope.md", reflowed(text), tables)

@@ -19,7 +19,7 @@ from ctxval import Campaign
 from ctxval.learning.structure import StructureSearch
 from friction_systems import AT_REST, DEVELOPED_AT_REST, DEVELOPMENT, REGULAR, SYSTEMS
 from json_lines import JsonLines
-from page_tables import GeneratedPage, reflowed, table
+from page_tables import GeneratedPage, included, reflowed
 from study_auto import RESULTS
 
 STORED = JsonLines(RESULTS / "friction.jsonl", ("system", "share", "seed", "looked_for"))
@@ -78,7 +78,7 @@ largest distance of {tasks:,} random tasks.
 
 "Friction" is the median of the friction found at each input, in its units. Friction that is larger in one direction
 (two-way-ratchet) is friction of constant size and a constant push. Friction that changes with the place (worn-guide)
-is beyond the method. [CPU times and campaigns without friction](tables/dry-friction.csv).
+is beyond the method.
 
 ## How the method was chosen
 
@@ -145,7 +145,7 @@ def page() -> GeneratedPage:
         developed_before=counted(False, DEVELOPMENT),
         false=len(validated(below)),
         below=len(below),
-        short=table([*HEADER[:3], HEADER[4], HEADER[8]], [[*row[:3], row[4], row[8]] for row in rows]),
+        short=included("dry-friction"),
     )
     return GeneratedPage("dry-friction.md", reflowed(text), {"dry-friction": (HEADER, rows)})
 

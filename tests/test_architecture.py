@@ -36,7 +36,7 @@ CONTROL = {
 SENTENCES = 80
 """Assertions on wording: texts have their snapshots, everything else asserts names, values and codes."""
 CONSTANTS = 120  # numbers in capitals that are no settings: tolerances of rounding, formats, layouts; never more
-READ_ONLY = ("campaign.plot", "report")
+READ_ONLY = ("report",)
 EXECUTING = {"execute", "run", "ask", "tell", "outcome", "distances", "plan"}
 
 

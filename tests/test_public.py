@@ -97,9 +97,7 @@ def arrays_without_shapes(name: str) -> list[str]:
     return without
 
 
-@pytest.mark.parametrize(
-    "name", [*ctxval.__all__, *(name for name in ctxval._MODULES if name not in ("cases", "plot"))]
-)
+@pytest.mark.parametrize("name", [*ctxval.__all__, *(name for name in ctxval._MODULES if name != "cases")])
 def test_docstrings_of_arrays_have_shapes(name: str) -> None:
     assert not arrays_without_shapes(ctxval._MODULES.get(name, name))
 

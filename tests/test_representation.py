@@ -302,7 +302,6 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "searches.GPUCB": searches.GPUCB,
     "searches.Prediction": lambda: searches.Prediction(lambda points: (points, points), lambda rows: rows, 150),
     "searches.Random": searches.Random,
-    "searches.Repeated": lambda: searches.Repeated(searches.Random(), 3),
     "searches.SamplingDiscarding": searches.SamplingDiscarding,
     "searches.TrustRegion": searches.TrustRegion,
     "systems.FMU": fmu,
@@ -501,7 +500,6 @@ EXACT = {
     "Transitions": "Transitions(x=(40, 2) in [-1, 1], u=(40, 1) in [0.01644, 25], x_next=(40, 2) all 0)",
     "Trial": "Trial(3, origin='initial', state='failed', attempts=2, parameters={'goal': 0.25})\n"
     "  failure: motor stalled",
-    "searches.Repeated": "Repeated(search=Random(), times=3)",
     "systems.FMU": "FMU(path='/somewhere/cart.fmu', states={'position': 'm', 'speed': 'm/s'}, inputs={'force': 'N'}, "
     "start={'position': 'x0'}, parameters={'mass': 2}, substeps=10)",
     "systems.Simulated": "Simulated(model=Linear(A=(2, 2) in [0, 1], B=(2, 1) in [0, 0.1], c=[0, 0], "

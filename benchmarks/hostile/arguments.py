@@ -18,7 +18,6 @@ _COMMANDS: dict[str, tuple[str, ...]] = {
         "--store",
         "--timeout",
         "--explore",
-        "--truth",
         "--json",
     ),
     "certify": (
@@ -64,7 +63,7 @@ _COMMANDS: dict[str, tuple[str, ...]] = {
     "init": ("--json",),
     "cases": ("--json",),
 }
-_FLAGS = ("--explore", "--truth", "--json", "--draw", "--resample", "--quick")
+_FLAGS = ("--explore", "--json", "--draw", "--resample", "--quick")
 _PLACES = (
     "a.sqlite",
     FILE,

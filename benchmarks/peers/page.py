@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array
-from page_tables import DOCS, GeneratedPage, Table, reflowed, table
+from page_tables import DOCS, GeneratedPage, Table, included, reflowed
 from peers import overhead, run
 from peers.functions import CASES, SEEDS
 from peers.methods import METHODS
@@ -360,9 +360,7 @@ def page() -> GeneratedPage:
         measured=measured_with(run.STORED.values(), AUTO),
         seeds=len(SEEDS),
         budgets=", ".join(f"{described.budget}" for described in CASES.values()),
-        short=table(
-            ["method", *(f"{case.title}, {case.dimension}-D" for case in CASES.values()), "CPU s"], short_rows()
-        ),
+        short=included("benchmarks-executions"),
         auto_scalar=against("auto", "scalar"),
         gpyopt_auto=against("gpyopt", "auto"),
         gpyopt_scalar=against("gpyopt", "scalar"),
@@ -376,6 +374,10 @@ def page() -> GeneratedPage:
     tables: dict[str, Table] = {
         "benchmarks-settings": (["method", "settings"], SETTINGS),
         "benchmarks-functions": (HEADER, function_rows()),
+        "benchmarks-executions": (
+            ["method", *(f"{case.title}, {case.dimension}-D" for case in CASES.values()), "CPU s"],
+            short_rows(),
+        ),
         "benchmarks-cases": (["function", "tasks", "budget", "d* of the seeds", "exceptions"], functions()),
         "benchmarks-pairs": (["method", "input", "compared with scalar", "compared with auto"], pairs()),
         "benchmarks-overhead": (

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from ctxval import Trajectory, cases, plot
+from ctxval import Trajectory, cases
 from ctxval._util.arrays import Array
 from ctxval.gp.surrogate import fit_surrogate
 from reproduce import study
@@ -17,7 +18,6 @@ from reproduce.study import TECHNIQUES, Claim, Columns, Scale, Study, agreement,
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 class FourFrameworks(Study):
@@ -124,7 +124,18 @@ class Trajectories(Study):
 
     def draw(self, results: Results, scale: Scale) -> Figure:
         model, system = self._loops()
-        figure = plot.trajectories(model, system, states=("angle [rad]", "rate [rad/s]"), inputs=("torque [N m]",))
+        figure = Figure(figsize=(6.4, 6.1), layout="constrained")
+        for row, name in enumerate(("angle [rad]", "rate [rad/s]", "torque [N m]")):
+            axes = figure.add_subplot(3, 1, row + 1, sharex=figure.axes[0] if row else None)
+            for run, colour, line, label in (
+                (system, "#D55E00", "-", "system S"),
+                (model, study.BLUE, "--", "model M"),
+            ):
+                values = run.states[:, row] if row < 2 else run.inputs[:, 0]
+                axes.plot(run.times[: len(values)], values, line, color=colour, label=label)
+            axes.set_ylabel(name)
+        figure.axes[-1].set_xlabel("time [s]")
+        figure.axes[0].legend(loc="best", fontsize=8)
         figure.suptitle(f"goal {PAPER.goal} rad", fontsize=10)
         return figure
 

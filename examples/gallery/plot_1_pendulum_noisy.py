@@ -6,9 +6,10 @@ The running example as it would be on a bench. Nothing of this is declared: nois
 executions, and the verdict is about nine of ten executions of each task.
 """
 
+import numpy as np
 from matplotlib import pyplot
 
-from ctxval import Campaign, cases, plot
+from ctxval import Campaign, cases
 
 experiment = cases.by_name("pendulum-noisy")
 campaign = Campaign(experiment.validation, seed=0).run(25, threshold=experiment.threshold)
@@ -17,5 +18,15 @@ print(verdict)
 
 # %%
 # The bound is one on the 0.9 quantile of the distance in every task.
-plot.surrogate_slice(campaign, threshold=experiment.threshold, bound=verdict.bound)
+space = campaign.validation.space
+unit = np.linspace(0, 1, 401)[:, None]
+mean, deviation = campaign.surrogate().predict(unit)
+goals = space.from_unit(unit)[:, 0]
+figure, axes = pyplot.subplots(layout="constrained")
+axes.fill_between(goals, np.maximum(mean - 1.96 * deviation, 0), mean + 1.96 * deviation, color="#B0B0B0", alpha=0.6)
+axes.plot(goals, mean)
+axes.plot(*zip(*[(trial.parameters["goal"], trial.distance) for trial in campaign.completed], strict=True), "ko")
+for limit in (experiment.threshold, verdict.bound):
+    axes.axhline(limit, linestyle="-.")
+axes.set(xlabel=space.labels[0], ylabel="distance [rad]")
 pyplot.show()

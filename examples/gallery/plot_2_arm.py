@@ -8,7 +8,7 @@ on a table: the task has two parameters.
 
 from matplotlib import pyplot
 
-from ctxval import Campaign, cases, plot, searches
+from ctxval import Campaign, cases, searches
 
 experiment = cases.by_name("arm", seed=0, model="linear")
 campaign = Campaign(experiment.validation, search=searches.GPUCB(), seed=0).run(16)
@@ -33,5 +33,10 @@ pyplot.show()
 
 # %%
 # The worst task: the trajectories of the model and of the arm under the same controller.
-plot.worst_trajectories(campaign)
+model, system = campaign.trajectories(campaign.worst)
+figure, axes = pyplot.subplots(layout="constrained")
+axes.plot(*model.states[:, 4:].T, "--", label="model")
+axes.plot(*system.states[:, 4:].T, label="arm")
+axes.set(xlabel="y [m]", ylabel="z [m]")
+axes.legend()
 pyplot.show()

@@ -6,9 +6,10 @@ The system and the model are random linear systems with ten states. The task has
 and the goal. The largest distance is known in closed form, so the result can be checked.
 """
 
+import numpy as np
 from matplotlib import pyplot
 
-from ctxval import Campaign, cases, plot, searches
+from ctxval import Campaign, cases, searches
 
 experiment = cases.by_name("linear", seed=0, dim=10)
 campaign = Campaign(experiment.validation, search=searches.Auto(thinking="fast"), seed=0).run(15, explore=True)
@@ -17,5 +18,10 @@ print(f"largest distance found {campaign.worst.distance:.4f}, d* = {truth.distan
 
 # %%
 # The line is the true d*.
-plot.convergence(campaign, bound=truth.distance)
+distances = campaign.trials.completed.distances
+figure, axes = pyplot.subplots(layout="constrained")
+axes.step(campaign.trials.completed.numbers, np.maximum.accumulate(distances), where="post")
+axes.plot(campaign.trials.completed.numbers, distances, "ko")
+axes.axhline(truth.distance, linestyle=":")
+axes.set(xlabel="trial", ylabel="distance")
 pyplot.show()

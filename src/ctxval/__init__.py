@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from ctxval import testing as testing
     from ctxval._util.arrays import Array
     from ctxval._util.registry import part
-    from ctxval.campaign import plot as plot
     from ctxval.campaign.campaign import Campaign, OpenTrial
     from ctxval.campaign.storage.store import Store
     from ctxval.campaign.watching import Watch
@@ -92,7 +91,7 @@ _MODULES = {
     **{name: name for name in ("certificates", "controllers", "data", "distances", "errors", "gp", "models", "report")},
     **{name: name for name in ("searches", "specs", "systems", "testing")},
     **{name: f"studies.{name}" for name in ("aspect1", "comparison", "fitting", "refinement", "replay", "safety")},
-    **{"cases": "paper.cases", "plot": "campaign.plot"},
+    "cases": "paper.cases",
 }
 """The public modules, which ``import ctxval`` alone makes usable: each is imported when it is first used."""
 

@@ -68,7 +68,6 @@ def made_by_name() -> Iterator[tuple[str, Callable[..., Any]]]:
         if isinstance(getattr(ctxval, name), type):
             yield name, getattr(ctxval, name)
     yield "CertificateOptions", certificates.CertificateOptions
-    yield "Repeated", searches.Repeated
 
 
 def constructions() -> Iterator[Any]:

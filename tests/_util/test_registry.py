@@ -46,7 +46,6 @@ NOT_BY_NAME = {
     "FeedforwardReLU",
     "IncrementScaling",
     "Refined",
-    "Repeated",
     "SequentialSearch",
 }
 """What has the method of its kind and cannot be made from a file: of arrays, of another search, or abstract."""

@@ -11,5 +11,5 @@ from ctxval.certificates.checks import CHECKS
 
 
 def test_the_table_is_current() -> None:
-    assert checks_page.PAGE.read_text(encoding="utf-8") == checks_page.page(), "run `make parts`."
-    assert all(f"| `{check.code}` |" in checks_page.table() for check in CHECKS)
+    assert checks_page.TABLE.read_text(encoding="utf-8") == checks_page.table(), "run `make parts`."
+    assert all(f"`{check.code}`," in checks_page.table() for check in CHECKS)

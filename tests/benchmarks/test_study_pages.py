@@ -17,7 +17,7 @@ import study_envelope
 import study_friction
 import study_main_job
 import study_refine
-import study_share
+import study_simulated_robots
 from peers import page as peers_page
 
 
@@ -37,7 +37,7 @@ OTHERS = {
     "servo": servo_page.page,
     "envelope": study_envelope.page,
     "dry-friction": study_friction.page,
-    "share": study_share.page,
+    "simulated-robots": study_simulated_robots.page,
 }
 """Pages that do not say with which sources their results were measured."""
 

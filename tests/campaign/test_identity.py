@@ -260,7 +260,6 @@ def test_a_failure_cannot_be_dropped(store: Path) -> None:
             searches.Auto(40),
             searches.Random(),
             searches.SamplingDiscarding(2),
-            searches.Repeated(searches.BayesianOptimisation(initial=2), 2),
         ),
     ],
     ids=repr,

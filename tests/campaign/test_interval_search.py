@@ -48,7 +48,7 @@ from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, hypercube_in, share_missed
 from ctxval.certificates.task_share import PREDICTED_ABOVE
 from ctxval.core.coverage import UntestedRest, UnvisitedRegion
-from ctxval.errors import InputError
+from ctxval.errors import CertificateError, InputError
 from ctxval.learning import dynamics_study
 from ctxval.learning.dynamics_posterior import condition
 from facts import assert_names, refuses
@@ -559,7 +559,7 @@ def test_a_share_of_the_tasks_is_falsified_by_tasks_drawn_where_more_is_predicte
 
 
 def test_no_share_is_asked_of_a_suite() -> None:
-    with pytest.raises(InputError):
+    with pytest.raises(CertificateError):
         Campaign(rig_suites.validation()).run(2, 1.0, share=0.9)
     with pytest.raises(InputError):
         Campaign(make_validation()).run(2, 1.0, share=0.9, envelope=True)

@@ -11,7 +11,6 @@ import pytest
 from conftest import make_validation
 from ctxval import Campaign, Task, Validation, controllers, searches
 from ctxval._util.arrays import Array
-from ctxval.campaign.choices import Choice
 from ctxval.campaign.proposals import DesignContinuity
 from ctxval.core.controller import AffineFeedback, Controller
 from ctxval.core.model import Model
@@ -87,9 +86,7 @@ def test_the_tasks_of_a_search_are_steady(search: searches.Search) -> None:
         assert campaign.validation.outcome(space.point(trial.parameters)).distance == trial.distance
 
 
-@pytest.mark.parametrize(
-    "search", [searches.CMAES(), *more(searches.Auto("fast"), searches.Repeated(searches.GPUCB(), 2))]
-)
+@pytest.mark.parametrize("search", [searches.CMAES(), *more(searches.Auto("fast"))])
 def test_a_resumed_campaign_chooses_the_same_tasks(search: searches.Search, tmp_path: Path) -> None:
     def tasks(campaign: Campaign) -> list[Any]:
         return [(trial.parameters, trial.unit_point.tolist(), trial.note) for trial in campaign.trials]
@@ -211,19 +208,3 @@ def test_every_synthesizer_is_tested_in_the_same_way(synthesizer: Any, jumps: bo
     steady = DesignContinuity(LoopPlanner(validation))
     found = [steady(point) for point in np.random.default_rng(1).random((12, 1))]
     assert (0 < steady.rejected < 12) if jumps else all(found)
-
-
-def test_tasks_of_older_stores_and_of_people_keep_their_digits_when_they_are_repeated(tmp_path: Path) -> None:
-    search = searches.Repeated(searches.GPUCB(), 2)
-    campaign = Campaign(make_validation(), search=search, store=tmp_path / "a.sqlite", seed=1)
-    goal = -3.0 + 6.0 * 0.7310585786300049
-    with campaign.store.sole_writer():
-        older = campaign.recorder.open(Choice(np.array([0.7310585786300049]), parameters={"goal": goal}))
-    campaign.tell(older, campaign.validation.execute(older.plan))
-    campaign.store.close()
-    resumed = Campaign(make_validation(), search=search, store=tmp_path / "a.sqlite", seed=1).run(3)
-    first, again, other = resumed.trials
-    assert first.origin == "acquisition"
-    assert again.parameters == first.parameters == {"goal": goal}
-    assert again.distance == first.distance
-    assert float(f"{other.parameters['goal']:.9g}") == other.parameters["goal"]

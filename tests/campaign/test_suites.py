@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from ctxval import Campaign, Task, TaskSuite, Trajectory, Validation, systems
-from ctxval.campaign import plot
 from ctxval.certificates import Audit, CertificateOptions, DistanceBound, WholeSuite
 from ctxval.core.controller import Controller
 from ctxval.errors import CertificateError, InputError
@@ -162,14 +161,6 @@ def test_tests_are_spread_over_the_values_of_every_parameter(seed: int) -> None:
     assert {each["kind"] for each in drawn} == set("abcd")
     goals = np.sort([float(each["goal"]) for each in drawn])
     assert np.diff([0.2, *goals, 2.0]).max() <= 2 * 1.8 / 8 + 0.2
-
-
-def test_pictures_of_suites_have_no_curve_between_tasks() -> None:
-    campaign = Campaign(validation(FINE, lambda p: p.goal), seed=0).run(4, explore=True)
-    assert plot.overview(campaign).get_xlabel() == "trial"
-    assert "go to" in plot.worst_trajectories(campaign).get_suptitle()
-    with refuses(InputError, "plot.convergence"):
-        plot.surrogate_slice(campaign)
 
 
 @pytest.mark.parametrize("share", [1.25, 0.6, 1e-3])

@@ -22,6 +22,7 @@ from ctxval.certificates.envelope import (
     withdrawn,
 )
 from ctxval.certificates.sentences.statements import IRREGULAR
+from ctxval.core.target import Quantile
 from ctxval.errors import CertificateError, InputError
 from facts import assert_names, refuses
 from rig_evidence import GOOD
@@ -144,7 +145,7 @@ def test_distances_that_the_draws_do_not_have_raise_the_factor(sign: int) -> Non
     above = replace(test, point=tuple(POINTS[int(drawn.mean.argmax())]))  # nothing is claimed of this task
     known = envelope_of(SPACE, drawn, replace(evidence, predictions=(above,)), EXECUTED, 0.6, 0.95)
     assert known.raised_by is None
-    noisy = replace(missed, quantile=0.9)  # noise explains it
+    noisy = replace(missed, target=Quantile(0.9))  # noise explains it
     assert envelope_of(SPACE, drawn, noisy, EXECUTED, 0.6, 0.95).raised_by is None
 
 

@@ -11,6 +11,7 @@ from ctxval.certificates.dynamics import Dynamics, certify_dynamics
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.task_share import PREDICTED_ABOVE, bet_on, bets_on_share
 from ctxval.certificates.verdict import counterexample, judge_by
+from ctxval.core.target import Share
 from ctxval.core.trial import Origin, Trial
 from ctxval.errors import InputError
 from rig_evidence import GOOD
@@ -27,13 +28,13 @@ def trial(number: int, distance: float, part: float | None = None, stake: float 
 
 def test_tasks_drawn_where_distances_above_are_predicted_falsify_a_share_and_chosen_ones_do_not() -> None:
     chosen = [trial(number, 1.5, origin="covering") for number in range(20)]
-    assert counterexample(chosen, TAU, share=SHARE) is None
+    assert counterexample(chosen, TAU, target=Share(SHARE)) is None
     assert counterexample(chosen, TAU) is not None
     drawn = [trial(number, 1.5, 0.02) for number in range(5)]
     bets = bets_on_share(drawn, TAU, SHARE, 0.95)
     assert bets.wealth == pytest.approx((0.2 + 0.8 * 2) ** 5)
-    assert counterexample(drawn, TAU, share=SHARE) is None
-    verdict = counterexample([*drawn, trial(5, 1.1, 0.02)], TAU, share=SHARE)
+    assert counterexample(drawn, TAU, target=Share(SHARE)) is None
+    verdict = counterexample([*drawn, trial(5, 1.1, 0.02)], TAU, target=Share(SHARE))
     assert verdict is not None
     assert verdict.answer == "falsified"
 
@@ -80,7 +81,7 @@ def test_the_stake_grows_with_the_share_that_is_predicted_above() -> None:
 def test_a_bound_on_a_share_validates_although_an_execution_exceeds_it() -> None:
     points = np.random.default_rng(0).random((9, 2))
     distances = np.array([1.3, *np.full(8, 0.5)])
-    evidence = replace(GOOD, share=SHARE, best=1.3)
+    evidence = replace(GOOD, target=Share(SHARE), best=1.3)
     sample = Sample(points, distances, ["covering", *["iid"] * 8], ["completed"] * 9, threshold=1.2)
     certificate = certify_dynamics(sample, replace(evidence, threshold=1.2))
     assert certificate.volume == pytest.approx(0.01)
@@ -102,10 +103,14 @@ def test_independent_draws_above_the_threshold_raise_what_tests_alone_say() -> N
     origins: list[Origin] = ["iid"] * 30
     distances = np.array([1.3, *np.full(29, 0.5)])
     sample = Sample(np.random.default_rng(0).random((30, 2)), distances, origins, ["completed"] * 30, threshold=1.2)
-    tests = certify_dynamics(sample, replace(GOOD, share=SHARE, threshold=1.2)).details["tests"]
-    none = certify_dynamics(replace(sample, distances=np.full(30, 0.5)), replace(GOOD, share=SHARE, threshold=1.2))
+    tests = certify_dynamics(sample, replace(GOOD, target=Share(SHARE), threshold=1.2)).details["tests"]
+    none = certify_dynamics(
+        replace(sample, distances=np.full(30, 0.5)), replace(GOOD, target=Share(SHARE), threshold=1.2)
+    )
     assert tests["above"] == 1
-    chosen = certify_dynamics(replace(sample, origins=["covering"] * 30), replace(GOOD, share=SHARE, threshold=1.2))
+    chosen = certify_dynamics(
+        replace(sample, origins=["covering"] * 30), replace(GOOD, target=Share(SHARE), threshold=1.2)
+    )
     assert chosen.details["tests"]["share_missed"] is None
     assert tests["share_missed"] > none.details["tests"]["share_missed"]
 

@@ -88,17 +88,3 @@ def test_a_wrong_option_is_refused_with_the_nearest(invoke: Any, command: str) -
         result = invoke(command, "linear", "--option", option)
         assert result.exit_code == 2
         assert_names(result.stderr.replace("\n", " "), *facts)
-
-
-def test_cases_are_listed_with_their_options(invoke: Any) -> None:
-    said = invoke("cases").stdout
-    assert "options: dim=4" in said
-    assert "options: model=fnn" in said
-    listed = json.loads(invoke("cases", "--json").stdout)
-    assert {"pendulum", "arm", "dubins", "linear"} <= set(listed)
-    assert_names(listed["linear"], "linear")
-    one = json.loads(invoke("cases", "dubins", "--json").stdout)
-    assert one == {"case": "dubins", "text": listed["dubins"], "options": {"variant": "paper", "distance": None}}
-    refused = invoke("cases", "dubin")
-    assert refused.exit_code == 2
-    assert_names(refused.stderr, "dubins")

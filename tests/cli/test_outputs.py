@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctxval import models, plot
+from ctxval import models
 from ctxval._util.files import MADE_BY, write_text, written_whole
 from ctxval.cli.base import require_folder, require_outputs
 from ctxval.core.trajectory import Transitions
@@ -21,20 +21,12 @@ from rig_logs import run
 MODEL = models.Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]])
 
 
-def picture(path: Path) -> None:
-    from matplotlib.figure import Figure
-
-    plot.save(Figure(), path)
-
-
 @pytest.mark.parametrize(
     ("name", "write"),
     [
         ("a.npz", lambda path: write_model_file(path, MODEL)),
         ("a.onnx", lambda path: write_model_file(path, MODEL)),
         ("a.data.npz", lambda path: models.write_transitions(path, run(5).transitions())),
-        ("a.png", picture),
-        ("a.svg", picture),
     ],
 )
 def test_what_was_written_may_be_replaced(name: str, write: Callable[[Path], None], tmp_path: Path) -> None:
@@ -102,7 +94,7 @@ def test_a_folder_with_files_of_others_is_refused(tmp_path: Path) -> None:
 def test_a_store_is_never_replaced(tmp_path: Path) -> None:
     path = tmp_path / "a.html"
     path.write_bytes(b"SQLite format 3\0" + bytes(100))
-    for write in (lambda: write_text(path, "a"), lambda: run(5).to_csv(path), lambda: picture(path)):
+    for write in (lambda: write_text(path, "a"), lambda: run(5).to_csv(path)):
         with refuses(InputError, "a.html"):
             write()
     assert len(path.read_bytes()) == 116

@@ -14,6 +14,7 @@ from scipy.optimize import lsq_linear
 
 from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
+from ctxval.core.target import Largest
 from ctxval.core.trajectory import Transitions
 from ctxval.learning import DynamicsStudy
 from ctxval.learning.dry_friction import DryFriction, found_friction
@@ -258,7 +259,7 @@ def test_friction_is_found_in_records_with_noise() -> None:
         loop = validation.outcome(validation.space.from_unit(point)).system_trajectory
         assert loop is not None
         executed.append((point, replace(loop, states=loop.states + 0.01 * rng.normal(size=loop.states.shape))))
-    learned = DynamicsStudy(validation, quantile=0.9).learn(executed)
+    learned = DynamicsStudy(validation, target=Largest(0.9)).learn(executed)
     assert learned is not None
     assert learned.friction["u[0]"] == pytest.approx(GRIP, rel=0.1)
     assert learned.friction["u[0] at rest at most"] > GRIP

@@ -15,14 +15,12 @@ from ctxval.report import ReportContext, context_of_campaign
 from ctxval.report.distance_model import DistanceModel
 from ctxval.report.findings import Answer, Finding, Question, findings_of, share_far_from_trials, smooth
 from ctxval.report.insights import (
-    bias,
     components,
     converged,
     explained,
     flips,
     goals,
     saturation,
-    unusual_motion,
     weak_region,
     weak_states,
 )
@@ -244,12 +242,8 @@ def test_designs_that_stop_early_are_counted(weak_motor: ReportContext) -> None:
     assert_names(found.text, 4)
 
 
-def test_the_bias_has_numbers_and_nothing_is_said_of_what_is_usual(swing: ReportContext) -> None:
-    assert found_by(unusual_motion, swing) is None
+def test_nothing_is_said_of_states_that_all_trials_visit(swing: ReportContext) -> None:
     assert found_by(weak_states, swing) is None
-    found = found_by(bias, swing)
-    assert found is not None
-    assert found.numbers
 
 
 def test_every_finding_is_one_text_with_a_light_and_json(swing: ReportContext, flat: ReportContext) -> None:

@@ -15,7 +15,6 @@ from ctxval.searches import (
     BaseSearch,
     Prediction,
     Random,
-    Repeated,
     SamplingDiscarding,
     Search,
     by_name,
@@ -108,14 +107,6 @@ def test_a_campaign_takes_any_search_of_three_methods(search: Search, tmp_path: 
     np.testing.assert_allclose(mean, [trial.distance for trial in resumed.trials], atol=1e-3)
 
 
-def test_any_search_of_three_methods_can_be_repeated() -> None:
-    repeated = Repeated(Stranger(), 2)
-    assert (repeated.initial, repeated.discard) == (0, 0)
-    campaign = Campaign(make_validation(), search=repeated).run(4)
-    points = [trial.unit_point.tolist() for trial in campaign.trials]
-    assert points[0] == points[1] != points[2] == points[3]
-
-
 def test_what_a_subclass_has_of_its_own_reaches_the_campaign(tmp_path: Any) -> None:
     Campaign(make_validation(), search=Noting(), store=tmp_path / "a.sqlite").run(2, until=lambda _: False)
     search = Noting()
@@ -133,9 +124,8 @@ def test_only_a_search_that_takes_a_prediction_is_given_one() -> None:
             given.append(prediction)
 
     assert Predicting().uses_prediction
-    assert Repeated(Predicting()).uses_prediction
     assert searches.Auto().uses_prediction
-    for search in (searches.GPUCB(), Repeated(searches.GPUCB()), BaseSearch.of(Stranger())):
+    for search in (searches.GPUCB(), BaseSearch.of(Stranger())):
         assert not search.uses_prediction
     Campaign(make_validation(), search=Predicting()).run(2)
     assert len(given) == 2
@@ -146,10 +136,7 @@ def test_the_estimate_of_the_maximum_is_the_search_s() -> None:
     assert searches.Random().estimate(points, values) == 9.0
     assert searches.SamplingDiscarding(2).estimate(points, values) == 2.7
     assert searches.SamplingDiscarding(5).estimate(points, values) is None
-    assert Repeated(searches.GPUCB(), 2).estimate(points, values) == pytest.approx(2.6)
-    assert Repeated(searches.SamplingDiscarding(1), 2).estimate(points, values) == pytest.approx(2.0)
-    assert Repeated(searches.GPUCB(), 3).estimate(points, values) is None
-    for search in (searches.Random(), Repeated(searches.Random(), 2), BaseSearch.of(Stranger())):
+    for search in (searches.Random(), BaseSearch.of(Stranger())):
         assert search.estimate(np.empty((0, 1)), np.empty(0)) is None
 
 

@@ -11,7 +11,7 @@ import pytest
 from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, systems, testing
 from ctxval._util.arrays import Array
 from ctxval.core.controller import Controller
-from ctxval.errors import InputError, ShapeError, UnknownNameError
+from ctxval.errors import InputError, ShapeError
 from facts import refuses
 
 pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'ctxval[pybullet]'")
@@ -135,18 +135,6 @@ def test_joints_of_a_urdf_have_the_order_of_the_model(urdf: Path) -> None:
     assert np.abs(runs[0]).max() > 1.0
 
 
-def test_a_urdf_alone_has_joints_and_servos_by_name(urdf: Path) -> None:
-    system = systems.PyBullet(urdf, joints=["elbow", "shoulder"], inputs=["elbow"], kp=20.0, kd=2.0, timestep=0.001)
-    task = Task([0.1, 0.0, 0.0, 0.0], horizon=2000, dt=0.001)
-    run = system.execute(lambda t, x: np.array([0.1]), task)
-    assert run.inputs.shape == (2000, 1)
-    assert np.abs(run.states[:, 0] - 0.1).max() < 0.05
-    torques = systems.PyBullet(urdf, timestep=0.001).execute(lambda t, x: np.zeros(2), task)
-    assert np.abs(torques.states[:, 1]).max() > 0.03
-    free = systems.PyBullet(urdf, free=True)
-    testing.check_system(free, lambda t, x: np.zeros(2), Task([0, 0, 2, 1, *[0.0] * 13], horizon=20, dt=1 / 240))
-
-
 def test_an_unstable_simulation_has_ended() -> None:
     mjcf = """<mujoco><option timestep="0.02"/><worldbody><body><joint name="a" axis="0 1 0" damping="5" armature="1"/>
       <geom size=".01" pos="0 0 .1" mass=".01"/></body></worldbody></mujoco>"""
@@ -158,18 +146,15 @@ def test_an_unstable_simulation_has_ended() -> None:
 def test_what_does_not_fit_is_named(urdf: Path) -> None:
     with refuses(InputError, "wrist"):
         systems.PyBullet(urdf, mjcf=TWIN.replace('"elbow"', '"wrist"'))
-    with refuses(UnknownNameError, "wrist"):
-        systems.PyBullet(urdf, joints=["shoulder", "wrist"])
-    with refuses(InputError, "elbow"):
-        systems.PyBullet(urdf, joints=["shoulder"], inputs=["shoulder"])
-    with refuses(InputError, "kp"):
-        systems.PyBullet(ARM, kp=1.0)
+    for given in ({"file": urdf}, {"file": ARM, "mjcf": ARM}):
+        with refuses(InputError, "mjcf"):
+            systems.PyBullet(**given)
     with refuses(InputError, "ball"):
         systems.PyBullet(ARM.replace('axis="1 1 0"', 'type="ball"').replace('joint="elbow"', 'joint="turn"'))
     with refuses(InputError, "1"):
         systems.PyBullet(ARM.replace("<motor ", '<general dyntype="filter" dynprm="0.1" '))
     with refuses(InputError, "missing.urdf"):
-        systems.PyBullet(urdf.with_name("missing.urdf"))
+        systems.PyBullet(urdf.with_name("missing.urdf"), mjcf=TWIN)
     system = systems.PyBullet(ARM)
     with refuses(ShapeError, 6, 4):
         system.execute(wave(2), Task(np.zeros(4), horizon=2, dt=0.001))

@@ -33,7 +33,6 @@ from ctxval.campaign.executors import Executor, worker_pool
 from ctxval.campaign.history import executed_trials
 from ctxval.campaign.identity import identify, search_of
 from ctxval.campaign.interval_search import IntervalSearch, with_next_task
-from ctxval.campaign.plot import overview
 from ctxval.campaign.storage.other_stores import provenance_of_store
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
@@ -56,7 +55,6 @@ from ctxval.learning.sensitivity import Sensitivity
 from ctxval.searches import Auto, Search
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from pandas import DataFrame
 
 __all__ = ["Campaign", "OpenTrial"]
@@ -299,7 +297,7 @@ class Campaign:
             self.state_threshold(threshold)
         predicts = decides is not None and decides.predicts
         with self.recorder.predicting(predicts, thinking), progress_shown(progress):
-            if predicts and not self.trials and options.kind.share == 1:
+            if predicts and not self.trials and not options.kind.target.by_draws:
                 self.recorder.dynamics.find_sensitivity(threshold)
             ExecutionLoop(
                 self.recorder,
@@ -508,9 +506,8 @@ class Campaign:
 
     @property
     def estimate(self) -> float | None:
-        """The search's estimate of d*: the largest distance, unless the search discards some (SD) or repeats its tasks.
+        """The search's estimate of d*: the largest distance, unless the search discards some (SD).
 
-        If the search repeats its tasks, the estimate is the largest mean distance of a task with all its repetitions.
         It is None if there are too few distances.
         """
         return self.recorder.search.estimate(*self._distances())
@@ -539,10 +536,8 @@ class Campaign:
         If an executed distance falsifies the threshold, the verdict needs nothing, and nothing is computed.
         """
         known, judged = self.provenance, self.recorder.trials if trials is None else trials
-        kind, confidence = options.kind, options.confidence
-        if threshold is not None and counterexample(
-            judged, threshold, known.quantities, confidence, kind.quantile, kind.share
-        ):
+        confidence, target = options.confidence, options.kind.target
+        if threshold is not None and counterexample(judged, threshold, known.quantities, confidence, target):
             return known
         return replaced(known, learned=self.recorder.dynamics.learned_for(judged, options))
 
@@ -589,16 +584,26 @@ class Campaign:
             CertificateError: if an option of the certificate is not valid.
         """
         options = CertificateOptions.or_automatic(certificate, confidence, resolution, share)
-        recorder = self.recorder
         self.state_threshold(threshold)
+        with progress_shown(progress):
+            return self.judged(threshold, options, thinking)[0]
+
+    def judged(
+        self, threshold: float, options: CertificateOptions, thinking: float | None
+    ) -> tuple[Verdict, Provenance]:
+        """Return the verdict, and what it follows from besides the trials; that the threshold was stated is not stored.
+
+        The arguments are those of :meth:`verdict`.
+        """
+        recorder = self.recorder
         recorder.dynamics.shortage = None
-        with progress_shown(progress), stage("certifying"), recorder.dynamics.thinking.limited(thinking):
+        with stage("certifying"), recorder.dynamics.thinking.limited(thinking):
             known, shortage = self.provenance_for(options, threshold), recorder.dynamics.shortage
             if shortage is None:
                 verdict = judge(recorder.trials, threshold, options, known)
             else:  # another bound has not seen what this evidence might show, such as noise
                 verdict = Verdict("undecided", threshold, f"{shortage}.", shortage=shortage.to_json())
-            return with_next_task(verdict, recorder, options)
+            return with_next_task(verdict, recorder, options), known
 
     @checked
     def certify(
@@ -686,13 +691,6 @@ class Campaign:
         its column is ``parameters.distance``. Unknown values are missing values.
         """
         return display.to_dataframe(self.trials, self.validation.space)
-
-    def plot(self, *, threshold: float | None = None, bound: float | None = None, ax: Axes | None = None) -> Axes:
-        """Draw the surrogate over one task parameter, or else the distances in their order; return the axes.
-
-        By default, the axes are new ones of ``matplotlib.pyplot``. The threshold and a bound on d* are drawn as lines.
-        """
-        return overview(self, threshold=threshold, bound=bound, ax=ax)
 
     def _distances(self) -> tuple[Array, Array]:
         """Return the points of the unit cube with a distance ``(n, d)``, and the distances ``(n,)``."""

@@ -27,6 +27,7 @@ from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.predictions import CheckedPrediction
 from ctxval.certificates.sample import Sample
+from ctxval.core.target import Target
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import REDEFINED, Trial, Trials
 from ctxval.core.validation import Validation
@@ -88,10 +89,10 @@ class CampaignDynamics:
         # Predictions that no store has, by their trials: each verdict checks those of the last trials.
         self._afterwards: Latest[Any, ExecutionPrediction | None] = Latest(2 * LIMITS.predictions)
 
-    def ask_of(self, quantile: float, share: float) -> None:
-        """State the share of the executions of a task, if the system is noisy, and of the tasks that are asked for."""
-        if (quantile, share) != (self.study.quantile, self.study.share):
-            self._use(self.study.fresh_copy(quantile, share))
+    def ask_of(self, target: Target) -> None:
+        """State what is asked for, before it is known whether the system is noisy."""
+        if target != self.study.target:
+            self._use(self.study.fresh_copy(target))
 
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
         """Return what the completed trials, and unless ``alone`` other recordings teach; None if it is nothing."""
@@ -125,6 +126,12 @@ class CampaignDynamics:
     def has_no_time(self, trials: Sequence[Trial]) -> bool:
         """Return whether the budget of the choice after trials allows no closed loops; nothing is learned."""
         return self.thinking.ledger(trials, len(executed_trials(self._store, trials))).spent_up
+
+    def affords(self, trials: Sequence[Trial], loops: int) -> bool:
+        """Return whether loops on what trials teach fit into a budget of their own, beside that of learning it."""
+        ledger = self.ledger(trials)
+        seconds = ledger.seconds("loops", lambda costs: costs.plan(loops) + costs.run(1, loops))
+        return ledger.costs is None or seconds <= ledger.costs.thinking.seconds
 
     def note(self, trials: Sequence[Trial]) -> dict[str, Any]:
         """Return what the next trial stores of the thinking on its task; empty without a budget."""
@@ -247,8 +254,7 @@ class CampaignDynamics:
                 learned, ledger = self.learned(trials), self.ledger(trials)
         if learned is None and not ledger.spent_up:
             return None
-        by, draws, replicates = self.thinking.search_settings, draws_for(confidence), 1
-        by = by if self.study.share == 1 else self.study.search.settings
+        by, draws, replicates = self.study.search.settings, draws_for(confidence), 1
         if learned is not None and learned.is_complete:
             replicates = 1 if learned.noisy is None else learned.noisy.replicates
             learned = learned.with_whole_search()
@@ -277,8 +283,7 @@ class CampaignDynamics:
             [self._allowed(trials), *((trial.number, trial.state, trial.distance, trial.note) for trial in trials)]
         )
         physical = "".join(f"{name} " for name in self.study.given.physical)
-        physical += "" if self.study.share == 1 else f"share {self.study.share} "
-        return f"evidence {confidence} {self.study.quantile} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
+        return f"evidence {confidence} {self.study.target.key} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
     def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float, ledger: Ledger) -> Evidence:
         draws, drawn_from = draws_for(confidence), learned.drawn_from
@@ -301,7 +306,7 @@ class CampaignDynamics:
         # How many tests a verdict needs is not known here. Negligible errors are no function to search, nor to push.
         if evidence.negligible or is_open(evidence, "learning", "coverage", "tested", "explained", "search"):
             return evidence
-        if self.study.share < 1:  # no largest distance is searched
+        if self.study.target.by_draws:  # no largest distance is searched
             return replace(evidence, unvisited_region=learned.unvisited_region)
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         jump, further = learned.study.search.largest_jump(drawn_from), dict[str, Any]()
@@ -348,7 +353,7 @@ class CampaignDynamics:
     def _evidence(
         self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase, noise: float = 0.0, **known: Any
     ) -> Evidence:
-        noisy, predictions = learned.noisy, list(self.checked(trials))
+        noisy, asked, predictions = learned.noisy, self.study.target, list(self.checked(trials))
         # Drawn tests come with the distances of their tasks on what is learned by now.
         drawn = [k for k, test in enumerate(predictions) if test.is_test and not test.is_noisy]
         if drawn:
@@ -368,7 +373,7 @@ class CampaignDynamics:
             # Loops on M with other parameters are cheap enough to search more of them.
             low_dimensional=self.study.planner.batched
             and (worst.points.shape[1] <= LIMITS.low_dimensional or bool(learned.values)),
-            quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
+            target=asked.with_noise() if noisy is not None and noisy.is_noisy else asked,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
             acting=learned.acting,
             friction=learned.friction,
@@ -382,7 +387,6 @@ class CampaignDynamics:
             best=Trials(trials).largest,
             worst=() if (largest := Trials(trials).worst) is None else tuple(largest.unit_point.tolist()),
             idle=tuple(learned.unseen_parameters),
-            share=self.study.share,
             **known,
         )
 
@@ -437,7 +441,7 @@ class CampaignDynamics:
         with contextlib.suppress(CertificateError):  # the certificate refuses the trials itself
             sample = replace(Sample.of(trials), suite=space.members)
             if kind.needs_evidence(sample):
-                self.ask_of(kind.quantile, kind.share)
+                self.ask_of(kind.target)
                 evidence = self.evidence(trials, options.confidence)
                 return Learned(evidence, None if evidence is not None else self.failure)
         return Learned()

@@ -34,6 +34,7 @@ from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.predictions import CheckedPrediction, missing_tests
 from ctxval.certificates.sample import without_success
 from ctxval.certificates.sentences.statements import EXECUTED_AGAIN, whole_suite_statement
+from ctxval.core.target import LARGEST_DISTANCE
 from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trial import Trial, Trials
 from ctxval.errors import InputError
@@ -66,7 +67,7 @@ class EnvelopeSearch:
         kind = interval.options.kind
         if not isinstance(kind, Automatic | Dynamics | WholeSuite):
             raise InputError(f"an envelope needs one of the certificates auto and dynamics, got {kind.name!r}.")
-        if kind.share < 1:
+        if kind.target.by_draws:
             raise InputError("an envelope tells which tasks stay below the threshold; leave the share out.")
         self._interval, self._recorder = interval, interval.recorder
         self._threshold, self._confidence = interval.limit, interval.options.confidence
@@ -94,7 +95,7 @@ class EnvelopeSearch:
             if regular is None:
                 return self._of(*known, trials)
             envelope = self._of(*regular, trials)
-            if known[1].quantile is not None:  # noise that the regular part does not have
+            if known[1].target.is_noisy:  # noise that the regular part does not have
                 return envelope
             smooth = self._of(*known, trials)  # soft contacts can be learned
             return envelope if envelope.share > smooth.share else smooth
@@ -108,7 +109,7 @@ class EnvelopeSearch:
         known = [trial for trial in trials if trial.distance is not None or trial in failed]
         executed = [(trial.unit_point, trial.least) for trial in known]
         # Further tasks check the interpolation between these; without batches, each costs a design of its own.
-        checks = (256 if evidence.quantile is None else 64) if learned.study.planner.batched else 0
+        checks = (64 if evidence.target.is_noisy else 256) if learned.study.planner.batched else 0
         try:
             if learned.split is not None:
                 evidence = self._left_out(learned, evidence)
@@ -138,7 +139,8 @@ class EnvelopeSearch:
         if learned is None or learned.posterior.noise > LIMITS.noise:
             return None
         without = learned.posterior.covariances.without_model
-        return learned, replace(evidence, quantile=None, lags=0, noise=learned.posterior.noise, without_model=without)
+        noise = learned.posterior.noise
+        return learned, replace(evidence, target=LARGEST_DISTANCE, lags=0, noise=noise, without_model=without)
 
     def _left_out(self, learned: LearnedDynamics, evidence: Evidence) -> Evidence:
         """Return evidence with the tests alone, each predicted from all executions of other tasks.
@@ -187,7 +189,7 @@ class EnvelopeSearch:
         if known is None:
             return None
         explained = all(known[1].explains(each, self._threshold) for each in known[1].predictions)
-        regular = None if known[1].quantile is None and explained else self._regular(trials, known[1])
+        regular = None if not known[1].target.is_noisy and explained else self._regular(trials, known[1])
         learned, evidence = regular or known
         missing = missing_tests(evidence.predictions, evidence.tests)
         if missing and self._left <= missing:
@@ -204,7 +206,7 @@ class EnvelopeSearch:
         if drawn.crossed is not None:  # executions of these tasks would not teach the regular part
             uncertain, uncovered = uncertain & (drawn.crossed <= 0), uncovered & (drawn.crossed <= 0)
             straddle = np.where(drawn.crossed <= 0, straddle, -np.inf)
-        few = evidence.executions < evidence.fewest_executions
+        few = evidence.executions < evidence.limits.fewest
         # Share of the tasks predicted below the threshold that may be uncertain or uncovered at the end.
         if few or (uncertain | uncovered).sum() > 0.03 * below.sum():
             score = straddle if uncertain.sum() >= uncovered.sum() else np.where(uncovered, leaving, -np.inf)
@@ -237,7 +239,7 @@ class EnvelopeSearch:
         pool, space = learned.study.search.pool, self._recorder.validation.space
         if space.members is not None:
             return self._at(learned, pool)
-        noisy = evidence.quantile is not None
+        noisy = evidence.target.is_noisy
         # If each draw has sequences of noise, closed loops run on fewer tasks.
         drawn = self._at(learned, np.concatenate([pool[:192] if noisy else pool, learned.executed]))
         if not learned.study.planner.batched:

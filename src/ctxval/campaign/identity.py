@@ -18,7 +18,7 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import AT_LEAST, REDEFINED, TOLD_ALONE, Change, Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreError, StoreMismatchError
-from ctxval.searches import DEFAULT, REGISTRY, Repeated, Search, by_name
+from ctxval.searches import DEFAULT, REGISTRY, Search, by_name
 
 _QUESTION = ("name", "seed", "search", "validation.space")
 """Parts of the description that must not differ, whatever reason the user gives."""
@@ -46,9 +46,6 @@ def _ready_made(described: Any) -> Search | None:
         return None
     name = described.get("type")
     try:
-        if name == Repeated.__name__:
-            repeated = _ready_made(described.get("search"))
-            return None if repeated is None else Repeated(repeated, described.get("times", 0))
         kind = next(kind for kind in map(REGISTRY.find, REGISTRY.built_in) if kind.__name__ == name)
         default = described_plainly(kind())
         options = {name: value for name, value in described.items() if value != default.get(name)}

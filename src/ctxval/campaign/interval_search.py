@@ -36,6 +36,7 @@ from ctxval.certificates.predictions import missing_tests, mostly_fail
 from ctxval.certificates.sample import SAME
 from ctxval.certificates.task_share import PREDICTED_ABOVE, bet_on
 from ctxval.certificates.verdict import counterexample, require_suite
+from ctxval.core.target import Target
 from ctxval.core.trial import Trial, Trials
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.share_search import ShareSearch
@@ -74,9 +75,7 @@ class IntervalSearch:
         if self.threshold is None and isinstance(self.options.kind, AnytimeAudit):
             raise InputError("an anytime audit ends by its threshold; state one, or run another certificate.")
         self.options.kind.require_usable(self.options.confidence, self.budget)
-        self.recorder.dynamics.ask_of(self.options.kind.quantile, self.options.kind.share)
-        if self._suite is not None and self._share < 1:
-            raise InputError("tasks of a suite are executed one by one, so no share of them is asked for.")
+        self.recorder.dynamics.ask_of(self._target)
 
     @property
     def limit(self) -> float:
@@ -84,9 +83,10 @@ class IntervalSearch:
         if self.threshold is not None:
             return self.threshold
         learned = self.recorder.dynamics.learned(self.recorder.trials) if self.predicts else None
-        if self._share < 1:
-            return (1 + self.within) * (0.0 if learned is None else learned.worst_of_mean.highest)
-        return (1 + self.within) * max(self.best, 0.0 if learned is None else learned.negligible)
+        if learned is None:
+            return (1 + self.within) * self._target.reached(self.best, lambda: 0.0)
+        least = max(self.best, learned.negligible)
+        return (1 + self.within) * self._target.reached(least, lambda: learned.worst_of_mean.highest)
 
     @property
     def best(self) -> float:
@@ -109,22 +109,20 @@ class IntervalSearch:
 
     @property
     def interval(self) -> tuple[float, float | None]:
-        """The largest executed distance, and the bound that a few posterior samples give; None if they give none.
+        """What the bound must reach, and the bound that a few posterior samples give; None if they give none.
 
-        If a share of the tasks is asked for, its distance on the posterior mean takes the place of the former.
+        The former is the largest executed distance or, of a share of the tasks, its distance on the posterior mean.
         """
         evidence = self._evidence()
-        if evidence is not None and self._share < 1:
-            return evidence.highest, evidence.bound
-        return self.best, None if evidence is None else evidence.bound
+        if evidence is None:
+            return self.best, None
+        return self._target.reached(self.best, lambda: evidence.highest), evidence.bound
 
     @property
     def is_falsified(self) -> bool:
         """Whether the executed distances falsify the limit; of a noisy system, one above it may not suffice."""
-        kind, confidence = self.options.kind, self.options.confidence
-        known = Quantities(space=self.recorder.validation.space)
-        trials = self.recorder.trials
-        return counterexample(trials, self.limit, known, confidence, kind.quantile, kind.share) is not None
+        known, confidence = Quantities(space=self.recorder.validation.space), self.options.confidence
+        return counterexample(self.recorder.trials, self.limit, known, confidence, self._target) is not None
 
     def choose(self) -> Choice | None:
         """Return the next task; None if the interval decides, or no task of a suite is left."""
@@ -134,7 +132,7 @@ class IntervalSearch:
         if self.recorder.predicts:  # what only reads a store chooses as the stored speed allows
             self.recorder.dynamics.thinking.measure(trials)
         if self.threshold is not None and any(trial.least > self.threshold for trial in trials):
-            repeated = self._against_noise() if self._share == 1 else None
+            repeated = self._against_noise()
             if repeated is not None or self.is_falsified:
                 return repeated
         if isinstance(self.options.kind, AnytimeAudit):
@@ -165,7 +163,7 @@ class IntervalSearch:
         trials = self.recorder.trials
         # A hypercube that was begun is completed, because what a part of it shows must not decide that it is left.
         number, row = divmod(spread_tests(trials), TESTS)
-        if (self.tests >= MANY or self._share < 1) and self._suite is None and not row:
+        if (self.tests >= MANY or self._target.by_draws) and self._suite is None and not row:
             return Choice.tested(self.recorder.draw(), "iid")
         if self._suite is not None:
             return Choice.tested(self.recorder.draws.hypercube(number)[row], "spread")
@@ -198,9 +196,11 @@ class IntervalSearch:
 
     def _against_noise(self) -> Choice | None:
         """Return a task whose execution tells whether noise explains a distance above the limit, if there is one."""
-        trials, quantile = self.recorder.trials, self.options.kind.quantile
+        if self._suite is not None or self._target.by_draws or not self.predicts:
+            return None
+        trials, quantile = self.recorder.trials, self._target.quantile
         bets = bets_against(trials, self.limit, quantile)
-        if self._suite is not None or not self.predicts or (bets is not None and bets.falsify(self.options.confidence)):
+        if bets is not None and bets.falsify(self.options.confidence):
             return None
         learned = self.recorder.dynamics.learned(trials)
         is_noisy = learned is not None and learned.noisy is not None and learned.noisy.is_noisy
@@ -230,20 +230,18 @@ class IntervalSearch:
 
     def _by_distance(self) -> Choice | None:
         """Return the task that the posterior bound of the distance needs; None if it decides."""
-        kind = self.options.kind
-        if self._share < 1 and self.recorder.trials:  # it bounds the largest distance alone
-            return self.test()
-        # No distance is known, all are 0, or each task of a suite is executed.
-        if not isinstance(kind, Automatic | DistanceBound) or not self.limit > 0 or self._suite is not None:
-            return Choice(planned_draws=0)
+        kind = self.options.kind.without_dynamics(self._target, self._suite)
+        # It does not bound a share of the tasks, no distance is known, all are 0, or each task of a suite is executed.
+        if not isinstance(kind, DistanceBound) or not self.limit > 0:
+            return self.test() if self._target.by_draws and self.recorder.trials else Choice(planned_draws=0)
         rule = StoppingRule(self.limit, self.options.confidence, kind.resolution)
         now = rule.decide(self.recorder.trials, self.budget - self.recorder.trials.executions)
         if not now.decided:
             # Whether the task is steady is not tested if there is no time for closed loops.
             rejected = 0 if self.recorder.dynamics.has_no_time(self.recorder.trials) else None
             return Choice(now.next_point, "covering", planned_draws=0, rejected=rejected)
-        missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self.recorder.trials.ended))
-        return self.test() if missing else None
+        asked, sample = self.options.kind, Sample.of(self.recorder.trials.ended)
+        return self.test() if isinstance(asked, Automatic) and asked.missing_tests(sample) else None
 
     def _by_dynamics(self, evidence: Evidence) -> Choice | None:
         """Return the task that the learned dynamics need, or that the posterior bound needs; None if one decides."""
@@ -272,12 +270,13 @@ class IntervalSearch:
         # For `auto`, the posterior bound of the distance is tried after many executions, besides tests, that decided
         # nothing, and earlier if they cover the tasks, as they soon do in few dimensions.
         lacks_tests = remedy.kind == "drawn"
-        if isinstance(kind, Automatic) and evidence.quantile is None and self._suite is None and self._share == 1:
+        by_distances = kind.without_dynamics(evidence.target, self._suite)
+        if isinstance(by_distances, DistanceBound):
             chosen = sum(trial.origin not in DRAWN for trial in trials)
             in_places = any(opened.code in ("unvisited_region", "untested_rest") for opened in open_checks(evidence))
             if chosen >= 16 and not lacks_tests and not in_places:
                 return self._by_distance()
-            covers = not evidence.negligible and covering(self._points(trials), kind.resolution, 0) is not None
+            covers = not evidence.negligible and covering(self._points(trials), by_distances.resolution, 0) is not None
             if covers and self._by_distance() is None:
                 return None
         ledger = dynamics.ledger(trials)
@@ -296,12 +295,12 @@ class IntervalSearch:
         learned = recorder.dynamics.learned(trials)
         if learned is None or not isinstance(learned.search, ShareSearch):
             return None
-        tasks = recorder.draws.many(trials, round(SEARCH.above / (1 - self._share)))
+        tasks = recorder.draws.many(trials, round(SEARCH.above / (1 - self._target.share)))
         rows = np.flatnonzero(learned.expected(tasks) > threshold)
         if not len(rows):
             return None
         # The first of the tasks, which are in no order.
-        stake = bet_on(learned.search.share_above(learned.drawn_from, threshold), self._share)
+        stake = bet_on(learned.search.share_above(learned.drawn_from, threshold), self._target.share)
         note = {PREDICTED_ABOVE: [float(threshold), len(rows) / len(tasks), stake]}
         return replace(Choice.tested(tasks[rows[0]]), note=note)
 
@@ -356,7 +355,7 @@ class IntervalSearch:
     def _fails(self, evidence: Evidence) -> bool:
         """Return whether predictions fail so often that the dynamics cannot be learned."""
         # Earlier predictions may have failed before it was known that a history, noise or dry friction matters.
-        known_since = evidence.quantile is not None or evidence.lags > 0 or evidence.friction
+        known_since = evidence.target.is_noisy or evidence.lags > 0 or evidence.friction
         if known_since or isinstance(self.options.kind, Dynamics):
             return False
         bound = evidence.upper
@@ -364,9 +363,8 @@ class IntervalSearch:
         return mostly_fail([prediction.held(tolerated) for prediction in evidence.predictions])
 
     @property
-    def _share(self) -> float:
-        """The share of the tasks that is asked for; 1 for the largest distance."""
-        return self.options.kind.share
+    def _target(self) -> Target:
+        return self.options.kind.target
 
     @property
     def _suite(self) -> Array | None:

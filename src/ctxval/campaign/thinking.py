@@ -110,9 +110,7 @@ class CampaignThinking:
     def search_settings(self) -> WorstCaseSettings:
         """The sizes of a search of all tasks."""
         space, batched = self._validation.space, bool(getattr(self._validation.synthesizer, "batched", False))
-        settings = WorstCaseSettings.for_dimension(space.dimension, batched)
-        members = None if space.members is None else len(space.members)
-        return settings if members is None else replace(settings, pool=members, evaluations=members, rounds=0)
+        return WorstCaseSettings.for_space(space, batched)
 
     def ledger(self, trials: Sequence[Trial], executions: int) -> Ledger:
         """Return the ledger of the next choice, which is ``spent`` if nothing can be learned within its budget."""
@@ -120,7 +118,7 @@ class CampaignThinking:
         if thinking is None:
             return Ledger()
         space, settings = self._validation.space, self.search_settings
-        smallest = settings if space.members is not None else reduced(settings, thinking.settings.shares[-1])
+        smallest = reduced(settings, thinking.settings.shares[-1])
         data = getattr(self._validation.model, "data", None)
         known = min(len(data), 600) if isinstance(data, Transitions) else 0
         sizes = Sizes.of(thinking.speed, space.dimension, executions, known)

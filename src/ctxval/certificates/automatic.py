@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 import scipy
 
+from ctxval._util.arrays import Array
 from ctxval._util.checked import NonNegativeInt, PositiveFloat, Probability
 from ctxval._util.registry import part
 from ctxval._util.representation import counted
@@ -25,6 +26,7 @@ from ctxval.certificates.sentences.statements import EXECUTED_AGAIN, INDEPENDENT
 from ctxval.certificates.sentences.verdicts import supported as supported_by
 from ctxval.certificates.task_share import Share
 from ctxval.core.quantiles import QUANTILE
+from ctxval.core.target import Largest, Target
 from ctxval.errors import CertificateError
 
 
@@ -107,7 +109,16 @@ class Automatic(CertificateKind):
     def needs_evidence(self, sample: Sample) -> bool:
         """Return whether the dynamics bound is tried: a resolution of one's own asks for the posterior bound."""
         usual = self.resolution == RESOLUTION and len(sample) >= LIMITS.fewest and not sample.failed
-        return usual and (sample.suite is None or bool(sample.not_executed))
+        return usual and sample.not_executed != 0
+
+    def without_dynamics(self, target: Target, suite: Array | None) -> CertificateKind:
+        """Return the kind that judges the distances alone; of noise or a share of the tasks, none does."""
+        match target:
+            case Largest() if suite is None:
+                return DistanceBound(self.resolution)
+            case Largest():
+                return WholeSuite(self.quantile)
+        return Dynamics(self.tests, self.quantile, self.share)
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the first certificate that keeps the threshold, or else the one that is nearer to a decision.
@@ -116,20 +127,15 @@ class Automatic(CertificateKind):
         neither decides, and more than 100 executions would come near to every task, it is the dynamics bound as long
         as its predictions hold.
         """
-        threshold = sample.threshold
-        uses_dynamics = sample.learned is not None and self.needs_evidence(sample)
-        if self.share < 1:  # no other kind bounds the distances of a share of the tasks
-            return Dynamics(tests=self.tests, quantile=self.quantile, share=self.share).certify(sample, confidence)
-        if sample.suite is not None and not uses_dynamics:
-            return WholeSuite(self.quantile).certify(sample, confidence)
+        threshold, other = sample.threshold, self.without_dynamics(self.target, sample.suite)
         by_dynamics = None
-        if uses_dynamics:
+        if sample.learned is not None and self.needs_evidence(sample):
             with suppress(CertificateError):
-                by_dynamics = Dynamics(tests=self.tests, quantile=self.quantile).certify(sample, confidence)
+                by_dynamics = Dynamics(self.tests, self.quantile, self.share).certify(sample, confidence)
                 if by_dynamics.details["quantile"] is not None or _decides(by_dynamics, threshold):
                     return by_dynamics  # the posterior bound of the distance is about systems without noise
-        if sample.suite is not None:
-            return by_dynamics or WholeSuite(self.quantile).certify(sample, confidence)
+        if not isinstance(other, DistanceBound):
+            return by_dynamics or other.certify(sample, confidence)
         preferred = False
         if by_dynamics is not None:
             preferred = _decides(by_dynamics, None) or bool(threshold and supported_by(by_dynamics, threshold))
@@ -139,7 +145,7 @@ class Automatic(CertificateKind):
             if preferred and farthest_task(sample.points) > self.resolution:
                 return by_dynamics  # the posterior bound, which takes seconds, would be withdrawn
         try:
-            certificate = DistanceBound(self.resolution).certify(sample, confidence)
+            certificate = other.certify(sample, confidence)
         except CertificateError:
             if by_dynamics is None:
                 raise

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
+from ctxval._util.arrays import Array
 from ctxval._util.registry import Registry
 from ctxval._util.representation import ShortRepr, Shown, call, line, lines
 from ctxval._util.texts import as_text
@@ -18,6 +19,7 @@ from ctxval.certificates.sentences import verdicts as sentences
 from ctxval.certificates.sentences.statements import ONE_CAMPAIGN
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.space import TaskSpace
+from ctxval.core.target import Target
 from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError, InputError, UnknownNameError
 
@@ -121,6 +123,11 @@ class CertificateKind(ShortRepr, ABC):
     share = 1.0
     """The share of the tasks that a threshold is about; 1 for all of them, whose largest distance is d*."""
 
+    @property
+    def target(self) -> Target:
+        """What a threshold is about, before it is known whether the system is noisy."""
+        return Target.asked(self.quantile, self.share)
+
     @classmethod
     def options(cls) -> tuple[str, ...]:
         """Return the names of its options: its fields, and ``volume`` if it validates but for a share of the tasks."""
@@ -135,6 +142,10 @@ class CertificateKind(ShortRepr, ABC):
     def needs_evidence(self, sample: Sample) -> bool:
         """Return whether the certificate of a sample reads what the executions teach of the dynamics."""
         return False
+
+    def without_dynamics(self, target: Target, suite: Array | None) -> CertificateKind:
+        """Return the kind that judges if learned dynamics do not, of a target and the tasks of a suite if it is one."""
+        return self
 
     @abstractmethod
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:

@@ -30,6 +30,7 @@ from ctxval.certificates.predictions import missing_tests
 from ctxval.certificates.sample import SAME
 from ctxval.certificates.sentences import withdrawals as sentences
 from ctxval.core.coverage import StateInputGap
+from ctxval.core.target import Quantile
 
 Stage = Literal["learning", "coverage", "tested", "tests", "explained", "search", "support", "bound"]
 
@@ -100,7 +101,7 @@ class Open:
 
 
 def _few_executions(evidence: Evidence) -> Gap:
-    fewest = evidence.fewest_executions
+    fewest = evidence.limits.fewest
     return Gap(fewest - evidence.executions, {"executions": evidence.executions, "fewest": fewest})
 
 
@@ -109,9 +110,8 @@ def _few_predictions(evidence: Evidence) -> Gap:
     return Gap(needed - checked, {"checked": checked, "needed": needed})
 
 
-def _noisy(evidence: Evidence) -> Gap | None:
-    values = {"percent": 100 * evidence.noise, "most": 100 * evidence.limits.noise}
-    return None if evidence.quantile is not None else Gap(evidence.noise, values)
+def _noisy(evidence: Evidence) -> Gap:
+    return Gap(evidence.noise, {"percent": 100 * evidence.noise, "most": 100 * evidence.limits.noise})
 
 
 def _noise_contradicted(evidence: Evidence) -> Gap:
@@ -172,19 +172,14 @@ def _unvisited_region(evidence: Evidence) -> Gap | None:
 def _not_tested(evidence: Evidence) -> Gap | None:
     if evidence.negligible:
         return None  # no distance is large
-    share, highest = evidence.limits.tested, evidence.highest
-    if evidence.quantile is not None:
-        share, highest = evidence.limits.noisy_tested, min(highest, float(np.median(evidence.maxima)))
-    return Gap(share * highest - evidence.best, {"highest": evidence.highest, "best": evidence.best})
+    highest = evidence.target.testable(evidence.highest, evidence.maxima)
+    return Gap(evidence.limits.tested * highest - evidence.best, {"highest": evidence.highest, "best": evidence.best})
 
 
 def _none_held(evidence: Evidence) -> Gap | None:
     if evidence.negligible:
         return None
-    # Most executions of a noisy task are far below the bound on a quantile, however well it is known.
-    size, what = evidence.bound, "bound"
-    if evidence.quantile is not None:
-        size, what = evidence.highest, "largest predicted distance"
+    size, what = evidence.target.large(evidence.bound, evidence.highest)
     large = [each for each in evidence.counted() if each.distance >= evidence.limits.matters * size]
     held = sum(each.held(evidence.raised, evidence.limits) for each in large)
     return Gap(1 - held, {"percent": 100 * evidence.limits.matters, "what": what})
@@ -222,13 +217,13 @@ def _drift(evidence: Evidence) -> Gap | None:
 
 
 def _unsupported(evidence: Evidence) -> Gap | None:
-    if evidence.quantile is None:
+    if not isinstance(evidence.target, Quantile):
         return None
-    level = evidence.raised if evidence.threshold is None else evidence.threshold
+    level, quantile = evidence.raised if evidence.threshold is None else evidence.threshold, evidence.target.quantile
     executions = len(evidence.executed)
-    ratio = support_of(evidence.executed, level, evidence.bound, evidence.quantile)
+    ratio = support_of(evidence.executed, level, evidence.bound, quantile)
     above = sum(each.distance > level for each in evidence.executed)
-    share = 100 * (1 - evidence.quantile)
+    share = 100 * (1 - quantile)
     values = {"above": above, "executions": executions, "level": level, "ratio": ratio, "share": share}
     return Gap(-ratio, values, -evidence.limits.supported)
 
@@ -308,7 +303,7 @@ def _farthest(evidence: Evidence) -> Array:
 
 def _at_the_bound(evidence: Evidence, known: int) -> Remedy:
     """Return a task whose distance may exceed the threshold, or every third time one that leads beyond the records."""
-    if evidence.share < 1 and evidence.highest > (evidence.threshold or np.inf):
+    if evidence.target.share < 1 and evidence.highest > (evidence.threshold or np.inf):
         return Remedy(kind="drawn above")  # such draws prove what share of the tasks exceeds it
     exceeds = evidence.threshold is not None and evidence.upper > evidence.threshold
     # Friction is known where records are dense.
@@ -354,7 +349,7 @@ def in_turn(evidence: Evidence, known: int) -> Remedy:
     While no prediction held at a distance that matters to the threshold, the largest predicted distance comes first.
     """
     threshold, limits = evidence.threshold, evidence.limits
-    if threshold is not None and evidence.quantile is None and not evidence.negligible:
+    if threshold is not None and not evidence.target.is_noisy and not evidence.negligible:
         large = (each for each in evidence.counted(threshold) if each.distance >= limits.matters * threshold)
         if not any(each.held(threshold, limits) for each in large):
             return _at_the_largest(evidence, known)
@@ -364,7 +359,7 @@ def in_turn(evidence: Evidence, known: int) -> Remedy:
 
 def _drawn(evidence: Evidence, known: int) -> Remedy:
     """Return a drawn task, once enough is learned for predictions of it to be tests."""
-    return in_turn(evidence, known) if evidence.executions < evidence.fewest_executions else Remedy(kind="drawn")
+    return in_turn(evidence, known) if evidence.executions < evidence.limits.fewest else Remedy(kind="drawn")
 
 
 def _past_a_failed_prediction(evidence: Evidence, known: int) -> Remedy:
@@ -400,8 +395,6 @@ def _influential(evidence: Evidence, known: int) -> Remedy:
 def _least_explained(evidence: Evidence, known: int) -> Remedy:
     least = least_explained(evidence.executed)
     assert least is not None
-    if evidence.quantile is None:  # another execution of the task is the same
-        return Remedy()
     task = np.array(least.point)
     times = sum(np.abs(np.array(each.point) - task).max() <= SAME for each in evidence.executed)
     return Remedy((task[None],), "again") if times < evidence.limits.repetitions else Remedy()

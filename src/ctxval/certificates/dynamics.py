@@ -41,7 +41,7 @@ from ctxval.errors import CertificateError
 
 # Attributes of the evidence that are numbers of the certificate as well.
 _COPIED = (
-    *("noise", "quantile", "lags", "acting", "physical", "suspect", "without_model", "without_data", "estimated"),
+    *("noise", "lags", "acting", "physical", "suspect", "without_model", "without_data", "estimated"),
     *("friction", "parameters", "peak_ratio", "jump", "search_shortfall", "disagreement", "negligible"),
 )
 MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
@@ -78,9 +78,8 @@ class Dynamics(CertificateKind):
                 f"audit.{advice_to_remeasure(sample)}"
             )
         evidence = learned.evidence
-        if self.share < 1 and (sample.suite is not None or (evidence is not None and evidence.quantile is not None)):
-            what = "tasks of a suite are executed one by one" if sample.suite is not None else "the system is noisy"
-            raise CertificateError(f"no share of the tasks is bounded, because {what}; leave the share out.")
+        if self.share < 1 and (evidence is not None and evidence.target.is_noisy):
+            raise CertificateError("no share of the tasks is bounded if the system is noisy; leave the share out.")
         if not (sample.best > 0 or (evidence is not None and evidence.negligible)):
             raise CertificateError(
                 "all distances are 0, so no prediction of a distance was tested. Check that the distance compares what "
@@ -122,7 +121,7 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
             "the dynamics give no bound: the closed loops of some posterior samples diverge, or an execution could not "
             "be predicted. More executions narrow them."
         )
-    finite, is_noisy = evidence.maxima[np.isfinite(evidence.maxima)], evidence.quantile is not None
+    finite, target = evidence.maxima[np.isfinite(evidence.maxima)], evidence.target
     last = evidence.counted()[-evidence.limits.predictions :]
     tests = latest_tests(evidence.predictions, evidence.tests)
     drawn = [test.origin for test in tests]
@@ -131,7 +130,7 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
     doubt, withdrawn_by = statements.both_outcomes(sample, stochastic=False), "executions_differ"
     # Two executions of one task must not differ by more than a prediction may be wrong.
     unlike = max(evidence.limits.error * evidence.bound, evidence.negligible)
-    if doubt is None and not is_noisy and (rows := sample.differing(unlike)) is not None:
+    if doubt is None and not target.is_noisy and (rows := sample.differing(unlike)) is not None:
         doubt = (
             f"{statements.two_distances(sample, rows)} in the recorded state, or was changed in between, so the bound "
             "is withdrawn; record more states, use --kind posterior, or use a new store after a change"
@@ -151,7 +150,8 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
         "raised_by_trial": None if worst is None else worst.trial,
         "error": error,
         "executions": evidence.executions,
-        **({} if evidence.share == 1 else {"share": evidence.share, "of_mean": evidence.highest}),
+        **target.to_json(),
+        **({"of_mean": evidence.highest} if target.share < 1 else {}),
         "draws": len(evidence.maxima),
         **({"thinking": {"replaced": list(evidence.replaced)}} if evidence.replaced else {}),
         "largest_draw": float(finite.max()) if len(finite) == len(evidence.maxima) else None,
@@ -168,7 +168,7 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
                 drawn, sample.points.shape[1], confidence, uniform=sample.is_uniform, selected=sample.selected
             ),
             "largest_error": max((test.error for test in tests), default=None),
-            **({} if evidence.share == 1 else _tests_alone(sample, level, confidence)),
+            **(_tests_alone(sample, level, confidence) if target.share < 1 else {}),
         },
         "checked": [{**each.to_json(), "held": bool(evidence.holds(each))} for each in evidence.predictions],
         "open_checks": [each.to_json() for each in opened],
@@ -178,7 +178,7 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
         "largest_gap_at": coverage.marginal.place,
         "resolution": coverage.resolution,
         **{name: list(value) if isinstance(value, tuple) else value for name, value in copied.items()},
-        "share_supported": share_supported(evidence.executions, above, confidence) if is_noisy else None,
+        "share_supported": share_supported(evidence.executions, above, confidence) if target.is_noisy else None,
         "variance_left_out": evidence.left_out,
         "unvisited_region": evidence.unvisited_region and asdict(evidence.unvisited_region),
         "untested_rest": evidence.untested_rest and asdict(evidence.untested_rest),
@@ -196,7 +196,7 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
         doubt=doubt,
         withdrawn_by=None if doubt is None else withdrawn_by,
         error=error,
-        volume=round(1 - evidence.share, 12),
+        volume=target.volume,
     )
 
 

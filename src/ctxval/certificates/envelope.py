@@ -51,6 +51,7 @@ from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.predictions import CheckedPrediction, agrees, latest_tests, missing_tests
 from ctxval.certificates.sentences.statements import IRREGULAR, dynamics_assumptions, envelope_statement
 from ctxval.core.space import TaskSpace
+from ctxval.core.target import LARGEST_DISTANCE, Target
 from ctxval.core.task_suite import TaskSuite
 from ctxval.errors import InputError
 
@@ -98,7 +99,8 @@ class Envelope(ShortRepr):
     #: executions, tests: numbers of executions, and of those that were predicted beforehand at drawn tasks
     executions: int = 0
     tests: int = 0
-    quantile: float | None = None  #: the share of the executions of a task that are below tau; None without noise
+    #: what stays below the threshold on each task: the distance, or its quantile under noise
+    target: Target = LARGEST_DISTANCE
     assumptions: tuple[str, ...] = ()  #: what it assumes
     #: the number of recorded steps, such as contacts, that are no part of what is learned; a task is not trusted if its
     #: run comes to states like theirs
@@ -158,8 +160,8 @@ class Envelope(ShortRepr):
     def to_json(self) -> dict[str, Any]:
         """Return the statement and its numbers, ready for JSON."""
         first = "threshold confidence units statement words share interpolated regions tasks factor raised_by margin"
-        names = f"{first} evaluated checks uncovered executions tests quantile assumptions irregular doubt".split()
-        plain = {name: getattr(self, name) for name in names}
+        names = f"{first} evaluated checks uncovered executions tests assumptions irregular doubt".split()
+        plain = {name: getattr(self, name) for name in names} | {"quantile": self.target.to_json()["quantile"]}
         lists = {name: list(value) for name, value in plain.items() if isinstance(value, tuple)}
         lists["regions"] = [region.to_json() for region in self.regions]
         return {
@@ -227,7 +229,7 @@ def _raised(drawn: DrawnDistances, evidence: Evidence, threshold: float, confide
     Contacts and hidden states are missed in both directions, so a distance that is too small counts as well.
     """
     factor, rises = drawn.factor(threshold, confidence), rises_of(evidence, threshold)
-    if evidence.quantile is None:  # else noise explains the differences
+    if not evidence.target.is_noisy:  # else noise explains the differences
         mean, spread = drawn.mean, drawn.spread(threshold)
         for each in (each for each in evidence.predictions if each.point):
             apart = np.abs(drawn.points - np.array(each.point)).max(axis=1)
@@ -277,7 +279,7 @@ def _interpolated(
     departures = drawn.departures(evidence.most_beyond)
     points, values = drawn.points, np.column_stack([drawn.upper(factor, threshold), departures])
     for point, distance in executed:
-        if distance > threshold and evidence.quantile is None:
+        if distance > threshold:
             far = np.abs(points - point).max(axis=1) > _SAME_TASK
             ratio = float(np.clip(distance / threshold, ENVELOPE.exceeded, LARGEST))
             points = np.concatenate([points[far], point[None]])
@@ -310,6 +312,7 @@ def envelope_of(
         irregular: the number of recorded steps that the draws are not learned from.
     """
     factor, raised_by = _raised(drawn, evidence, threshold, confidence)
+    executed = () if evidence.target.is_noisy else executed  # one execution tells little of a quantile
     envelope = Envelope(
         space,
         threshold,
@@ -320,7 +323,7 @@ def envelope_of(
         evaluated=len(drawn.points),
         executions=evidence.executions,
         tests=sum(each.is_test for each in evidence.predictions),
-        quantile=evidence.quantile,
+        target=evidence.target,
         assumptions=(*dynamics_assumptions(evidence), *([IRREGULAR] if irregular else [])),
         irregular=irregular,
         units=units,
@@ -360,7 +363,7 @@ def _with_loops(
 ) -> Envelope:
     """Return the envelope that runs the closed loops of tasks, with the shares of others ``(N, d)`` that it adds."""
     factor, threshold = envelope.factor or 0.0, envelope.threshold
-    exceeding = [point for point, distance in executed if distance > threshold and envelope.quantile is None]
+    exceeding = [point for point, distance in executed if distance > threshold]
 
     def by_loops(points: Array) -> Array:
         blocks = [np.zeros(0)]
@@ -391,7 +394,7 @@ def _of_suite(
     leaving = drawn.leaving(most) > 1
     bounds[rows] = np.where((upper <= threshold) & ~leaving, upper, np.inf)
     uncovered[rows] = (upper <= threshold) & leaving
-    for point, distance in executed if envelope.quantile is None else ():
+    for point, distance in executed:
         row = int(suite.rows_at(point))
         bounds[row], uncovered[row] = distance if distance <= threshold else np.inf, False
     names = tuple(name for name, bound in zip(suite.task_names, bounds, strict=True) if np.isfinite(bound))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self, get_origin
+from typing import Any, Self
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from ctxval.certificates.prediction_tests import MANY, TESTS
 from ctxval.certificates.predictions import CheckedPrediction, latest_tests
 from ctxval.core.coverage import StateInputCoverage, UnsampledCorner, UnsampledParameter, UntestedRest, UnvisitedRegion
 from ctxval.core.learned_numbers import PushedDistances
+from ctxval.core.target import LARGEST_DISTANCE, Target
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +47,7 @@ class Evidence(ShortRepr):
     disagreement: float = 0.0  #: share by which the smaller result of these searches is below the larger one
     tests: int = TESTS  #: the number of tests that a bound needs; see :mod:`~ctxval.certificates.prediction_tests`
     pushed: PushedDistances | None = None  #: largest distances under pushes; None if the bound is withdrawn anyway
-    quantile: float | None = None  #: share of the executions of a task that are below the maxima; None without noise
+    target: Target = LARGEST_DISTANCE  #: what the maxima are in each draw: by default, the largest distance
     lags: int = 0  #: number of earlier records and inputs that the learned dynamics depend on
     acting: Mapping[str, float] = field(default_factory=dict)  #: sizes of effects of inputs by labels, such as a delay
     #: the dry friction at each input, by its label, the most at rest if that is more, and its share of the input if it
@@ -72,8 +73,6 @@ class Evidence(ShortRepr):
     scatter: float = 0.0
     #: the largest distance under errors of M as small as all that were recorded; 0 if such errors are learned
     negligible: float = 0.0
-    #: the share of the tasks whose largest distance the maxima are; with less than 1, they are quantiles over the tasks
-    share: float = 1.0
     replaced: tuple[str, ...] = ()  #: stages that were left out, or replaced by cheaper ones, for lack of time
     # The question
     best: float = 0.0  #: the largest executed distance
@@ -81,7 +80,12 @@ class Evidence(ShortRepr):
     confidence: float = 0.95  #: that of the bound
     threshold: float | None = None  #: the value that the bound must not exceed; None if there is none
     idle: tuple[int, ...] = ()  #: the indices of the task parameters that M's loops do not depend on
-    limits: CheckLimits = LIMITS  #: those of the checks
+    settings: CheckLimits = LIMITS  #: the limits of the checks, with those of noise
+
+    @cached_property
+    def limits(self) -> CheckLimits:
+        """The limits of the checks."""
+        return self.settings.of_noise() if self.target.is_noisy else self.settings
 
     @property
     def is_parametric(self) -> bool:
@@ -115,9 +119,7 @@ class Evidence(ShortRepr):
     def bound(self) -> float:
         """The order statistic of the maxima, raised by what searches and predictions have missed."""
         last = self.predictions[-self.limits.predictions :]
-        upper = self.upper * self.search_shortfall
-        # A noisy execution may exceed the quantile that is bounded, and so may some tasks that of a share.
-        upper = max(upper, self.best) if self.quantile is None and self.share == 1 else upper
+        upper = self.target.raised(self.upper * self.search_shortfall, self.best)
         return upper + 0.5 * max((prediction.excess for prediction in last), default=0.0)
 
     @cached_property
@@ -130,16 +132,11 @@ class Evidence(ShortRepr):
         return self.bound if worst is None else self.bound + worst.error / self.limits.error
 
     @property
-    def fewest_executions(self) -> int:
-        """The fewest executions for a bound."""
-        return self.limits.fewest if self.quantile is None else self.limits.noisy_fewest
-
-    @property
     def most_beyond(self) -> float:
         """By how much closed loops may leave the records, as a share of the visited range."""
         if self.coverage.pair is None:
             return self.limits.gap  # each extreme of so many coordinates would take an execution of its own
-        return self.limits.beyond if self.quantile is None else self.limits.noisy_beyond
+        return self.limits.beyond
 
     @property
     def jumps(self) -> bool:
@@ -215,21 +212,20 @@ class Evidence(ShortRepr):
         import msgspec  # needed by campaigns alone
 
         plain: dict[str, Any] = msgspec.to_builtins(self, enc_hook=lambda value: value.tolist())
-        return {name: value for name, value in plain.items() if name != "limits"}
+        stored = {name: value for name, value in plain.items() if name not in ("settings", "target")}
+        return {**stored, **self.target.to_json()}
 
     @classmethod
     def from_json(cls, values: Any) -> Self | None:
         """Return the evidence that :meth:`to_json` returned; None if these are not its values."""
         import msgspec
 
-        def array(kind: type, value: Any) -> Any:
-            if get_origin(kind) is not np.ndarray:
-                raise NotImplementedError(kind)
-            return np.array(value, dtype=np.float64)
+        def decoded(kind: type, value: Any) -> Any:
+            return Target.from_json(values) if kind is Target else np.array(value, dtype=np.float64)
 
         try:
-            return msgspec.convert(values, cls, dec_hook=array)
-        except (msgspec.ValidationError, ValueError):
+            return msgspec.convert(values and {**values, "target": None}, cls, dec_hook=decoded)
+        except (msgspec.ValidationError, TypeError, ValueError):
             return None
 
 

@@ -5,7 +5,10 @@ They were chosen on development systems; docs/calibration.md reports them on oth
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
 
 from ctxval.core.coverage import UntestedRest
 
@@ -58,13 +61,21 @@ class CheckLimits:
 
     # Remedies
     near: float = 0.7  #: share of the way from the largest distance to the threshold from which a draw is near it
-    repetitions: int = 4  #: executions of a task that are chosen because one execution does not explain it
+    repetitions: int = 0  #: executions of a task that are chosen because one execution does not explain it
+    noisy_repetitions: int = 4  #: the same for a noisy system; of others, another execution is the same
 
     # Whether a search can find the maximum
     peak_ratio: float = 0.05  #: share by which a maximum may exceed the median of nearly the same tasks
     jump: float = 0.01  #: jump of the predicted distance between nearly equal tasks, as a share of the bound
     low_dimensional: int = 2  #: task parameters up to which intensified searches find maxima in spite of jumps
     agree: float = 0.05  #: share by which intensified searches may differ, and exceed the usual search
+
+    def of_noise(self) -> Self:
+        """Return the limits of a noisy system, whose noise has none, and of which repetitions tell something."""
+        fewest, beyond, tested = self.noisy_fewest, self.noisy_beyond, self.noisy_tested
+        return replace(
+            self, fewest=fewest, beyond=beyond, tested=tested, noise=np.inf, repetitions=self.noisy_repetitions
+        )
 
 
 LIMITS = CheckLimits()

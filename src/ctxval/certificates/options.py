@@ -36,7 +36,7 @@ class CertificateOptions(ShortRepr):
     @property
     def left_out(self) -> float:
         """The share of the tasks that may exceed the threshold, by the volume or by the share of its kind."""
-        return max(self.volume, round(1 - self.kind.share, 12))  # as a certificate of the share leaves out
+        return max(self.volume, self.kind.target.volume)
 
     @classmethod
     def or_automatic(

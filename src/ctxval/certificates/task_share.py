@@ -51,6 +51,7 @@ class ShareBets:
     above: int  #: the number of these executions that exceed the threshold
     executions: int  #: the number of these executions
     least: float  #: the share of the tasks that exceeds the threshold at least, with the confidence; 0 if none is known
+    share: float  #: the share of the tasks that is said to stay below the threshold
 
     def falsify(self, confidence: float) -> bool:
         """Return whether the statement is falsified with a confidence."""
@@ -81,7 +82,7 @@ def bets_on_share(trials: Sequence[Trial], threshold: float, share: float, confi
         middle = np.sqrt(low * high)
         low, high = (middle, high) if log_wealth(middle) >= needed else (low, middle)
     least = float(low) if log_wealth(low) >= needed else 0.0
-    return ShareBets(float(np.exp(log_wealth(1 - share))), int(above.sum()), len(bets), least)
+    return ShareBets(float(np.exp(log_wealth(1 - share))), int(above.sum()), len(bets), least, share)
 
 
 def _bet_of(trial: Trial, threshold: float, share: float) -> tuple[float, float] | None:

@@ -16,8 +16,8 @@ from ctxval.certificates.options import CONFIDENCE, CertificateOptions, Confiden
 from ctxval.certificates.provenance import Provenance
 from ctxval.certificates.sample import Sample, without_success
 from ctxval.certificates.sentences import verdicts as sentences
-from ctxval.certificates.task_share import bets_on_share
-from ctxval.core.quantiles import QUANTILE
+from ctxval.certificates.task_share import ShareBets, bets_on_share
+from ctxval.core.target import LARGEST_DISTANCE, Target
 from ctxval.core.trial import Trial, designs_sentence
 from ctxval.errors import CertificateError
 
@@ -73,19 +73,17 @@ def counterexample(
     threshold: PositiveFloat,
     quantities: Quantities = NO_UNITS,
     confidence: float = CONFIDENCE,
-    quantile: float = QUANTILE,
-    share: float = 1.0,
+    target: Target = LARGEST_DISTANCE,
 ) -> Verdict | None:
     """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it.
 
     The distance of the steps before a failure counts, but less than that of whole executions. With noise, a single one
-    does not suffice (:mod:`ctxval.certificates.bets`), except in a suite without repeats. Nor does it falsify that a
-    ``share`` of the tasks stays below the threshold (:mod:`ctxval.certificates.task_share`).
+    does not suffice (:mod:`ctxval.certificates.bets`), except in a suite without repeats. Nor does it if the target is
+    the distance of a share of the tasks (:mod:`ctxval.certificates.task_share`).
     """
     tau = float(threshold)
-    bets = _bets(trials, tau, quantile, quantities) if share == 1 else None
-    of_share = bets_on_share(trials, tau, share, confidence) if share < 1 else None
-    if not all(each is None or each.falsify(confidence) for each in (bets, of_share)):
+    bets = _bets(trials, tau, target, quantities, confidence)
+    if bets is not None and not bets.falsify(confidence):
         return None
     failed = without_success(trials)
     above = [
@@ -96,9 +94,6 @@ def counterexample(
     if not above:
         return None
     worst = max(above, key=lambda trial: (trial.distance is not None, trial.least))
-    if of_share is not None:
-        why = sentences.share_falsified(worst, tau, quantities, of_share, share, confidence)
-        return Verdict("falsified", tau, why, worst)
     return Verdict("falsified", tau, sentences.falsified(worst, trials, tau, quantities, bets, confidence), worst)
 
 
@@ -122,7 +117,7 @@ def judge_by(
     quantities = known.quantities
     quantile = certificate.details.get("quantile") or (kind or by_name).quantile
     share = certificate.details.get("share", 1.0) if kind is None else kind.share
-    falsified = counterexample(trials, tau, quantities, certificate.confidence, quantile, share)
+    falsified = counterexample(trials, tau, quantities, certificate.confidence, Target.asked(quantile, share))
     if falsified is not None:
         return replace(falsified, certificate=certificate)
     if not certificate.covers(tau, volume):
@@ -151,10 +146,10 @@ def judge(
     All trials of the campaign are given. If the theory of the certificate refuses them, the verdict is undecided.
     """
     known, chosen = provenance or Provenance(), options or CertificateOptions()
-    quantile, share = chosen.kind.quantile, chosen.kind.share
-    if share < 1:  # the largest distance of another store falsifies no share of the tasks
+    target = chosen.kind.target
+    if target.by_draws:  # the largest distance of another store falsifies no share of the tasks
         known = replace(known, beside=tuple(replace(each, worst=None) for each in known.beside))
-    verdict = counterexample(trials, threshold, known.quantities, chosen.confidence, quantile, share)
+    verdict = counterexample(trials, threshold, known.quantities, chosen.confidence, target)
     if verdict is None:
         try:
             certificate = _certified(trials, chosen, known, threshold)
@@ -165,8 +160,8 @@ def judge(
     designs, remarks = designs_sentence(trials), list(verdict.remarks)
     parts = [verdict.reason.removesuffix("."), verdict.expected, designs]
     remarks += [] if designs is None else [designs]
-    bets = _bets(trials, float(threshold), quantile, known.quantities) if share == 1 else None
-    if verdict.answer != "falsified" and bets is not None and bets.above:
+    bets = _bets(trials, float(threshold), target, known.quantities, chosen.confidence)
+    if verdict.answer != "falsified" and isinstance(bets, Bets) and bets.above:
         above = sentences.noise_may_explain(bets, float(threshold), known.quantities, chosen.confidence)
         parts.insert(0 if verdict.answer == "undecided" else len(parts), above)
         remarks.append(above)
@@ -175,12 +170,16 @@ def judge(
     return replace(verdict, reason=f"{reason}.{caution}", remarks=tuple(remarks))
 
 
-def _bets(trials: Sequence[Trial], threshold: float, quantile: float, quantities: Quantities) -> Bets | None:
+def _bets(
+    trials: Sequence[Trial], threshold: float, target: Target, quantities: Quantities, confidence: float
+) -> Bets | ShareBets | None:
     """Return the bets against a threshold; None if one execution above it suffices."""
+    if target.by_draws:
+        return bets_on_share(trials, threshold, target.share, confidence)
     space = quantities.space
     if space is None or space.members is None:
-        return bets_against(trials, threshold, quantile)
-    return bets_against(trials, threshold, quantile, noisy=True) if space.repeats > 1 else None
+        return bets_against(trials, threshold, target.quantile)
+    return bets_against(trials, threshold, target.quantile, noisy=True) if space.repeats > 1 else None
 
 
 def _certified(
@@ -206,6 +205,8 @@ def require_suite(kind: CertificateKind) -> None:
             f"a certificate of the kind {kind.name!r} is not for a suite of tasks, each of which is executed once; use "
             f"one of {kinds}."
         )
+    if kind.share < 1:
+        raise CertificateError("tasks of a suite are executed one by one, so no share of them is bounded.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +243,7 @@ def assess(
     known, kind = provenance or Provenance(), options.kind
     falsified = None
     if threshold is not None:
-        falsified = counterexample(trials, threshold, known.quantities, options.confidence, kind.quantile, kind.share)
+        falsified = counterexample(trials, threshold, known.quantities, options.confidence, kind.target)
         if falsified is None:
             verdict = judge(trials, threshold, options, known)
             if verdict.certificate is None:

@@ -343,11 +343,10 @@ def print_table(rows: dict[str, Any], units: str = "") -> None:
     for key, value in rows.items():
         text = as_text(value) or "none"
         match value:
-            case {"task": dict() as task, "distance": distance, **rest}:
+            case {"task": dict() as task, "distance": distance}:
                 # All digits: the task that is typed again must be the one that was executed.
                 at = ", ".join(f"{name} = {item}" for name, item in task.items())
-                how = f" ({rest['method']})" if "method" in rest else ""
-                text = f"{f'{distance:.4g} {units}'.rstrip()} at {at}{how}"
+                text = f"{f'{distance:.4g} {units}'.rstrip()} at {at}"
         table.add_row(line(key.replace("_", " ")), line(text))
     out.print(table)
 

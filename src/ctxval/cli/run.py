@@ -11,7 +11,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from ctxval import Campaign, Experiment, Truth, Verdict
+from ctxval import Campaign, Experiment, Verdict
 from ctxval._util.progress import also_listening
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.texts import reason_of
@@ -46,7 +46,6 @@ def run(
     quantile: float | None = None,
     share: float | None = None,
     resolution: float | None = None,
-    truth: bool = False,
     dask: str | None = None,
     again_failed: str | None = None,
     accept_change: str | None = None,
@@ -66,9 +65,6 @@ def run(
     experiment, certificate = settings.load(), settings.certificate_options
     if (doubt := experiment.doubt_of_parameters) is not None:
         notes.say(doubt)
-    if truth and experiment.truth is None:
-        who = "Only experiments with a `truth` function have it, such as the cases of the paper"
-        raise InputError(f"the true maximum of {experiment.name!r} is not known. {who}.")
     limit, total = limits.completed_by(settings, experiment)
     if envelope and limit is None:
         raise InputError("--envelope needs --threshold: it is the largest acceptable distance.")
@@ -91,7 +87,6 @@ def run(
                 again=again_failed,
                 **pool,
             )
-        known = experiment.truth() if truth and experiment.truth is not None else None
         digest = campaign.store.digest()
         verdict = (
             None if limit is None else campaign.verdict(limit, certificate=certificate, thinking=settings.thinking)
@@ -101,7 +96,7 @@ def run(
             with suppress(CertificateError):
                 bound = campaign.certify(certificate=certificate)
         report: dict[str, Any] = {"case": experiment.name, "search": settings.search.type, "seed": settings.seed}
-        report |= {"budget": total, "units": experiment.units, **_summary(campaign, verdict, bound, known)}
+        report |= {"budget": total, "units": experiment.units, **_summary(campaign, verdict, bound)}
         report |= {"store": str(path), "other_stores": [str(other.path) for other in other_stores(path)]}
         report |= {"options": settings.options} if settings.options else {}
         report |= {} if campaign.sensitivity is None else {"sensitivity": campaign.sensitivity.to_json()}
@@ -118,9 +113,10 @@ def run(
                 if not current:
                     from ctxval import report as reports  # imported here, because a finished campaign has one
 
-                    reports.write_page(
-                        reports.context_of_campaign(campaign, verdict, budget=total, envelope=trusted), page
+                    context = reports.context_of_campaign(
+                        campaign, verdict, budget=total, envelope=trusted, thinking=settings.thinking
                     )
+                    reports.write_page(context, page)
                 report["report"] = str(page)
             except Exception as error:  # it must not hide the verdict, for which executions were paid
                 err.say(f"no report: {reason_of(error)}")
@@ -146,12 +142,10 @@ def _print_parts(experiment: Experiment, limit: float | None) -> None:
     out.say((experiment.name, "bold"), sentence, wrap=True)
 
 
-def _summary(
-    campaign: Campaign, verdict: Verdict | None, bound: Certificate | None, known: Truth | None
-) -> dict[str, Any]:
+def _summary(campaign: Campaign, verdict: Verdict | None, bound: Certificate | None) -> dict[str, Any]:
     unknown, estimate = dict.fromkeys(("verdict", "reason", "rests_on", "threshold")), campaign.estimate
     expected = None if verdict is None else verdict.expected
-    summary = {
+    return {
         **base.summary_of(campaign.trials),
         "controllers": designs_sentence(campaign.trials),
         "estimate": estimate,
@@ -160,12 +154,6 @@ def _summary(
         "certificate": None if bound is None else bound.to_json(),
         "expected": None if expected is None else asdict(expected),
     }
-    if known is not None:
-        task = campaign.validation.space.describe_point(known.parameters.points)
-        missed = None if estimate is None else 100 * (known.distance - estimate) / known.distance
-        largest = {"distance": known.distance, "task": task, "method": known.method}
-        summary |= {"truth": largest, "error_percent": missed}
-    return summary
 
 
 def _print_result(
@@ -188,7 +176,7 @@ def _print_result(
     base.print_failures(report["failures"])
     failed = f", of which {report['failed']} failed" if report["failed"] else ""
     rows = {"executions": f"{report['executions']} of at most {report['budget']}{failed}"}
-    rows |= {key: report[key] for key in ("worst", "truth", "error_percent", "store", "report") if key in report}
+    rows |= {key: report[key] for key in ("worst", "store", "report") if key in report}
     if verdict is not None and verdict.answer == "falsified":
         advice = [f"`{shlex.join(['ctxval', 'why', report['store']])}` tells what M lacks"]
         if trusted is None and campaign.recorder.search.uses_prediction:

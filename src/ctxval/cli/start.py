@@ -1,4 +1,4 @@
-"""``ctxval init``, ``check`` and ``cases``: experiment files and the built-in cases of the paper."""
+"""``ctxval init`` and ``check``: experiment files."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from ctxval._util.files import write_text
 from ctxval._util.texts import shell_word
 from ctxval._util.toml import toml_text
 from ctxval.cli import policies
-from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, named_values, out, print_table
+from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, named_values, out
 from ctxval.cli.config.check import aspect1_findings, check_experiment
-from ctxval.cli.config.parts import part, plain_options
+from ctxval.cli.config.parts import part
 from ctxval.cli.config.settings import read_settings
 from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import InputError
-from ctxval.paper import cases as known_cases
 from ctxval.studies import aspect1 as model_alone
 from ctxval.studies.safety.draws import spec_distance
 
@@ -114,24 +113,3 @@ def check(
     if aspect1:
         report["aspect1"] = None if simulated is None else simulated.to_json()
     return report, status
-
-
-@command()
-def cases(name: str | None = None) -> Any:
-    listed: dict[str, tuple[str, dict[str, Any]]] = {}
-    for each in list(known_cases.REGISTRY) if name is None else [name]:
-        try:
-            listed[each] = known_cases.text_of(each), plain_options(each)
-        except InputError as error:
-            if name is not None:
-                raise
-            listed[each] = str(error), {}
-    rows = {}
-    for each, (text, options) in listed.items():
-        texts = [key if default is None else f"{key}={default}" for key, default in options.items()]
-        rows[each] = f"{text}; options: {', '.join(texts)}" if texts else text
-    print_table(rows)
-    if name is None:
-        return {each: text for each, (text, _) in listed.items()}
-    text, options = listed[name]
-    return {"case": name, "text": text, "options": options}

@@ -14,7 +14,7 @@ from ctxval._util.describe import describe
 from ctxval._util.latest import Latest
 from ctxval._util.representation import ShortRepr
 from ctxval.core.distance import ComposedDistance
-from ctxval.core.quantiles import QUANTILE
+from ctxval.core.target import LARGEST_DISTANCE, Target
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.uncertain import uncertain_in
 from ctxval.core.validation import Validation
@@ -42,7 +42,7 @@ from ctxval.learning.regular import RegularSettings, split_transitions
 from ctxval.learning.share_search import ShareSearch
 from ctxval.learning.stage_costs import Costs, Ledger, ThinkingSettings, reduced
 from ctxval.learning.structure import StructureSearch, StructureSettings, most_telling
-from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
+from ctxval.learning.worst_case import SuiteSearch, WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
 
@@ -69,8 +69,7 @@ class DynamicsStudy(ShortRepr):
         given: the user's validation.
         validation: the same with the states of M if only outputs are recorded, and with the physical task parameters
             as further states; everything is learned of these.
-        quantile: the share of the executions of a task that a distance is about, if the system is noisy.
-        share: the share of the tasks whose distances are asked for; 1 for the largest one.
+        target: what is asked for of the distances over all tasks.
         effects: effects of inputs, with their sizes; empty if commands act as they are.
         friction: M with the dry friction that it lacks, of which the residual is learned; None without.
         with_data: whether the data that M was made from are learned from.
@@ -81,17 +80,16 @@ class DynamicsStudy(ShortRepr):
         self,
         validation: Validation,
         seed: int = 0,
-        quantile: float = QUANTILE,
+        target: Target = LARGEST_DISTANCE,
         extended: ExtendedValidation | None = None,
         settings: LearningSettings | None = None,
         *,
         effects: Found = (),
         friction: DryFriction | None = None,
         with_data: bool = True,
-        share: float = 1.0,
     ) -> None:
-        self.settings, self.share = settings or LearningSettings(), share
-        self.given, self.seed, self.quantile = validation, seed, quantile
+        self.settings = settings or LearningSettings()
+        self.given, self.seed, self.target = validation, seed, target
         self.effects, self.friction, self.with_data = effects, friction, with_data
         of_inputs = InputEffects(tuple(each.effect for each in effects))
         self.extended = ExtendedValidation(validation, of_inputs) if extended is None else extended
@@ -105,11 +103,9 @@ class DynamicsStudy(ShortRepr):
         #: largest distances of tasks if M errs by so much in each step, of each error and task
         self.under_errors: dict[bytes, dict[bytes, float]] = {}
 
-    def fresh_copy(self, quantile: float | None = None, share: float | None = None) -> DynamicsStudy:
+    def fresh_copy(self, target: Target | None = None) -> DynamicsStudy:
         """Return a study of the same experiment that has learned nothing yet, with what is given."""
-        quantile = self.quantile if quantile is None else quantile
-        share = self.share if share is None else share
-        return DynamicsStudy(self.given, self.seed, quantile, settings=self.settings, share=share)
+        return DynamicsStudy(self.given, self.seed, target or self.target, settings=self.settings)
 
     def made(
         self,
@@ -130,8 +126,8 @@ class DynamicsStudy(ShortRepr):
             same = self.extended if given is self.given else self.extended.of(given)
             extended = same if effects is None else None
             self._made[key] = DynamicsStudy(
-                given, self.seed, self.quantile, extended, self.settings,
-                effects=kept, friction=friction, with_data=with_data, share=self.share,
+                given, self.seed, self.target, extended, self.settings,
+                effects=kept, friction=friction, with_data=with_data,
             )  # fmt: skip
         return self._made[key]
 
@@ -151,17 +147,18 @@ class DynamicsStudy(ShortRepr):
 
     @functools.cached_property
     def search(self) -> WorstCaseSearch:
-        """Searches the tasks for the largest distance of each draw."""
-        settings = WorstCaseSettings.for_dimension(self.validation.space.dimension, self.planner.batched)
-        if self.share < 1:
-            return ShareSearch(self.planner, self.seed, self.share, settings)
-        return WorstCaseSearch(self.planner, self.seed, settings)
+        """Searches the tasks for the target of each draw."""
+        settings = WorstCaseSettings.for_space(self.validation.space, self.planner.batched)
+        if self.target.by_draws:
+            return ShareSearch(self.planner, self.seed, self.target.share, settings)
+        of_largest = WorstCaseSearch if self.validation.space.members is None else SuiteSearch
+        return of_largest(self.planner, self.seed, settings)
 
     def search_within(self, ledger: Ledger, replicates: int) -> WorstCaseSearch:
         """Return the search, of fewer tasks if the budget of a ledger does not allow all of them."""
-        if not ledger.is_limited or self.share < 1:  # fewer tasks tell nothing of a share of them
+        if not ledger.is_limited or not self.search.settings.reducible:
             return self.search
-        shares = self.settings.thinking.shares if self.search.members is None else (1.0,)
+        shares = self.settings.thinking.shares
         for share in shares:
             settings = reduced(self.search.settings, share) if share < 1 else self.search.settings
 
@@ -365,7 +362,7 @@ class DynamicsStudy(ShortRepr):
         settings = self.settings.noise
         if self.friction is not None:  # what it does within a step would seem to be a history
             settings = replace(settings, structures=tuple(each for each in settings.structures if not each.lags))
-        return NoiseStudy(self.extended, self.planner, self.search, self.seed, self.quantile, settings)
+        return NoiseStudy(self.extended, self.planner, self.search, self.seed, self.target.quantile, settings)
 
     def without(self, learned: LearnedDynamics, k: int) -> LearnedDynamics | None:
         """Return what all executions but one teach, with the same hyperparameters and structure of noise."""

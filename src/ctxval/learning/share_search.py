@@ -46,7 +46,8 @@ class ShareSearch(WorstCaseSearch):
         above = of_share.above if planner.batched else of_share.alone
         top = int(np.ceil(of_share.top * above))
         count = round(above / (1 - share))
-        super().__init__(planner, seed, replace(settings, random=count, shared=top + of_share.others, rounds=0))
+        shared = top + of_share.others
+        super().__init__(planner, seed, replace(settings, random=count, shared=shared, rounds=0, reducible=False))
         self.share, self.above, self.of_share = share, above, of_share  #: above: expected number above the quantile
         self._latest: tuple[AnyPosterior, Array] | None = None
 

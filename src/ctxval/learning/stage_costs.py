@@ -458,7 +458,9 @@ def speed_to_json(speed: Speed) -> dict[str, Any]:
 
 
 def reduced(settings: WorstCaseSettings, share: float) -> WorstCaseSettings:
-    """Return the settings of a search of a share of the tasks."""
+    """Return the settings of a search of a share of the tasks; the same if it would tell nothing of all of them."""
+    if not settings.reducible:
+        return settings
 
     def part(count: int, least: int) -> int:
         return min(count, max(least, round(share * count)))

@@ -17,6 +17,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask, single_threaded
 from ctxval._util.boxes import latin_hypercube, moves_to_bounds, separated_rows
+from ctxval.core.space import TaskSpace
 from ctxval.gp.ascent import ascend
 from ctxval.gp.global_search import search_globally
 from ctxval.learning.closed_loops import AnyPosterior, LoopPlanner, PlannedTasks, loop_pairs
@@ -50,6 +51,7 @@ class WorstCaseSettings:
     screened_tasks: int = 1500  # number of tasks in its search on the mean
     further: int = 256  # number of random tasks in a screening if draws differ in the dry friction at rest
     random: int = 0  # number of random tasks from which the distance of a share of them follows; 0 for the largest one
+    reducible: bool = True  # whether a search of fewer tasks tells something of all of them
 
     def intensified(self, dimension: int) -> int:
         """Return the number of tasks of each of two intensified searches."""
@@ -62,6 +64,15 @@ class WorstCaseSettings:
             return cls(pool=64, evaluations=256, local_maxima=6, shared=12, moves=2, rounds=0, peaks=1, nearby=8)
         evaluations = (512, 2048, 4096, 6000, 6000, 6000, 12000)[min(dimension, 7) - 1]  # for 1, 2, ... parameters
         return cls(pool=min(1024, evaluations // 4), evaluations=evaluations)
+
+    @classmethod
+    def for_space(cls, space: TaskSpace, batched: bool = True) -> WorstCaseSettings:
+        """Return settings for a task space; of a suite, each task is run, and nothing lies between them."""
+        settings = cls.for_dimension(space.dimension, batched)
+        if space.members is None:
+            return settings
+        count = len(space.members)
+        return replace(settings, pool=count, evaluations=count, rounds=0, peaks=0, further=0, reducible=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +101,6 @@ class WorstCaseSearch:
     def __init__(self, planner: LoopPlanner, seed: int, settings: WorstCaseSettings | None = None) -> None:
         self.planner = planner
         self.settings = WorstCaseSettings() if settings is None else settings
-        self.members = planner.validation.space.members
-        if self.members is not None:  # nothing lies between tasks of a suite
-            self.settings = replace(self.settings, pool=len(self.members), evaluations=len(self.members), rounds=0)
         self.dimension, self._seed = planner.validation.space.dimension, seed
 
     def expected_loops(self, draws: int) -> int:
@@ -112,9 +120,7 @@ class WorstCaseSearch:
 
     @functools.cached_property
     def pool(self) -> Array:
-        """Tasks of a suite, or spread over the cube, every second one with coordinates at bounds, shape ``(N, d)``."""
-        if self.members is not None:
-            return self.members
+        """Tasks spread over the cube, every second one with coordinates at bounds, shape ``(N, d)``."""
         rng = np.random.default_rng([self._seed, 0])
         count = self.settings.pool
         points = latin_hypercube(count, self.dimension, rng)
@@ -139,12 +145,10 @@ class WorstCaseSearch:
     def largest_jump(self, posterior: AnyPosterior) -> float:
         """Return by how much the mean's distance of a task differs at most from the middle of those on both sides.
 
-        The tasks are those of the pool. If the distance is a smooth function of the task, this is hardly anything. It
-        is 0 for a suite, whose tasks are all searched. A distance whose attribute ``kinked`` is true is continuous in
-        the trajectories and has kinks, which are no jumps: they become small between tasks that are nearer.
+        The tasks are those of the pool. If the distance is a smooth function of the task, this is hardly anything. A
+        distance whose attribute ``kinked`` is true is continuous in the trajectories and has kinks, which are no jumps:
+        they become small between tasks that are nearer.
         """
-        if self.members is not None:
-            return 0.0
         with single_threaded():
             tasks, planned = self._in_rows
             of_rows = self.planner.distances(posterior.mean, planned, tasks.shape[0] * 3)[0].reshape(-1, 3)
@@ -187,11 +191,6 @@ class WorstCaseSearch:
         The distances there of the pool's tasks ``(N,)`` are given, and ``known`` tasks ``(k, d)`` to look at in any
         case. Globally, large distances on a small share of the tasks are looked for, too.
         """
-        if self.members is not None:
-            left, values = self._left(known), _finite(of_pool)
-            order = [row for row in np.argsort(-values, kind="stable") if left[row]] or [int(values.argmax())]
-            local_maxima = self.members[order[: self.settings.local_maxima]]
-            return self._of_mean(posterior, float(values[order[0]]), local_maxima, len(values))
         settings, distance = self.settings, self._on_one(posterior.mean.searched)
         best = self.pool[np.argsort(-_finite(of_pool), kind="stable")[: settings.local_maxima * 4]]
         starts = np.concatenate([known, best])
@@ -230,7 +229,7 @@ class WorstCaseSearch:
         with single_threaded():
             tasks = self._shared_tasks(of_mean, known, self.settings.shared // 4, rng)
             draws = posterior.draw(self.relevant(posterior, tasks, rng), rng, 1, self.settings.screened_draws)
-            if _sticks(posterior) and self.members is None:  # their largest distances lie far from those of the mean
+            if _sticks(posterior) and self.settings.further:  # their largest distances lie far from those of the mean
                 further = self.pool[rng.permutation(len(self.pool))[: self.settings.further]]
                 points, maxima, loops = self._search_draws(draws, np.concatenate([tasks, further]), rng)
                 return of_mean.with_draws(maxima, points, loops, draws.left_out)
@@ -253,7 +252,7 @@ class WorstCaseSearch:
             # controllers jump from task to task, the largest distance is a needle that a search finds by chance. Kinks
             # are no needles: they are flat between tasks that are nearer. Nor is a task at which a joint is just held,
             # like those on one side of it.
-            peaks = of_mean.local_maxima[: 0 if self.members is not None else self.settings.peaks]
+            peaks = of_mean.local_maxima[: self.settings.peaks]
             settings = self.settings
             near = settings.near / settings.nearer if is_kinked(self.planner.validation.distance) else settings.near
             moves = rng.uniform(-near, near, (len(peaks), settings.nearby, self.dimension))
@@ -267,17 +266,9 @@ class WorstCaseSearch:
         return replace(of_mean.with_draws(maxima, points, loops, draws.left_out), peak_ratio=peak_ratio)
 
     def _shared_tasks(self, of_mean: WorstCase, known: Array, count: int, rng: np.random.Generator) -> Array:
-        """Return the tasks that draws share: local maxima, known tasks and random ones; of a suite, those not known."""
-        if self.members is not None:
-            left = self.members[self._left(known)]
-            return left if len(left) else of_mean.local_maxima
+        """Return the tasks that draws share: local maxima, known tasks and random ones."""
         random = self.pool[rng.permutation(len(self.pool))[:count]]
         return np.concatenate([of_mean.local_maxima, known, random])
-
-    def _left(self, known: Array) -> Mask:
-        """Return which tasks of a suite are not among points ``(k, d)``: the distance of the others is known."""
-        assert self.members is not None
-        return np.asarray(~(self.members[:, None] == known).all(axis=2).any(axis=1))
 
     def _distances(self, draws: Draws, points: Array) -> Array:
         return _finite(self.planner.distances(draws, self.planner.plan(points), len(points)))
@@ -356,6 +347,37 @@ class WorstCaseSearch:
         chosen = np.flatnonzero(may_be_worst)
         values[np.ix_(others, chosen)] = self._distances(draws[others], tasks[chosen])
         return values, len(first) * len(tasks) + len(others) * len(chosen)
+
+
+class SuiteSearch(WorstCaseSearch):
+    """Runs all tasks of a suite, in the place of a search; the distances of executed tasks are known."""
+
+    @functools.cached_property
+    def pool(self) -> Array:
+        """The tasks of the suite, points ``(N, d)``."""
+        members = self.planner.validation.space.members
+        assert members is not None
+        return members
+
+    def largest_jump(self, posterior: AnyPosterior) -> float:
+        """Return 0: no task lies between those of a suite."""
+        return 0.0
+
+    def on_mean(
+        self, posterior: AnyPosterior, of_pool: Array, known: Array, rng: np.random.Generator, *, globally: bool = True
+    ) -> WorstCase:
+        """Return the largest distance on the posterior mean of the tasks that are not ``known``, of all if all are."""
+        left, values = self._left(known), _finite(of_pool)
+        order = [row for row in np.argsort(-values, kind="stable") if left[row]] or [int(values.argmax())]
+        local_maxima = self.pool[order[: self.settings.local_maxima]]
+        return self._of_mean(posterior, float(values[order[0]]), local_maxima, len(values))
+
+    def _shared_tasks(self, of_mean: WorstCase, known: Array, count: int, rng: np.random.Generator) -> Array:
+        left = self.pool[self._left(known)]
+        return left if len(left) else of_mean.local_maxima
+
+    def _left(self, known: Array) -> Mask:
+        return np.asarray(~(self.pool[:, None] == known).all(axis=2).any(axis=1))
 
 
 def _sticks(posterior: AnyPosterior) -> bool:

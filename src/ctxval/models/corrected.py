@@ -15,7 +15,7 @@ from ctxval.core.state_geometry import geometry_of
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.increments import standardised_pairs
-from ctxval.models.smooth_maps import SmoothMap, affine, kernel_sum, matern, total
+from ctxval.models.smooth_maps import SmoothMap, kernel_sum, matern
 
 Linearised = Literal["corrected", "model"]  #: whose Jacobian controllers are designed with
 
@@ -80,8 +80,8 @@ class Correction(ShortRepr):
     @functools.cached_property
     def _unlimited(self) -> SmoothMap:
         block = max(1, 40_000 // max(1, len(self.centres)))  # whose covariances stay in the processor's cache
-        kernels = kernel_sum(matern(self.length_scales, 2.5), self.centres, self.weights, block)
-        return total(kernels, affine(self.linear[:-1], self.linear[-1]))
+        kernel, scales = matern(self.length_scales), self.length_scales
+        return kernel_sum(kernel, scales, self.centres, self.weights, linear=self.linear, block=block)
 
     def _beyond(self, rows: Array) -> Array:
         return np.asarray(rows - np.clip(rows, self.low, self.high))

@@ -6,7 +6,7 @@ import functools
 import itertools
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,7 @@ from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.gp.cholesky import factorise
 from ctxval.gp.regression import log_likelihood_of_outputs, most_likely
-from ctxval.models.smooth_maps import Slopes, SmoothMap, kernel_sum, network
+from ctxval.models.smooth_maps import SmoothMap, kernel_sum, relu_network
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +170,7 @@ class FeedforwardReLU(IncrementModel):
 
     @functools.cached_property
     def _map(self) -> SmoothMap:
-        return network(self.weights, self.biases, "relu")
+        return relu_network(self.weights, self.biases)
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,11 +258,11 @@ class GaussianProcessModel(IncrementModel):
 
     @functools.cached_property
     def _map(self) -> SmoothMap:
-        def kernel(Z: Array, centres: Array) -> tuple[Array, Slopes]:
+        def kernel(Z: Array, centres: Array) -> tuple[Array, Callable[[], Array]]:
             K = self.covariance(Z, centres)
-            return K, lambda: [(K, 1.0, self.covariance.length_scales**-2.0)]
+            return K, lambda: K
 
-        return kernel_sum(kernel, self.centres, self.weights, block=2048)
+        return kernel_sum(kernel, self.covariance.length_scales, self.centres, self.weights, block=2048)
 
 
 def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:

@@ -69,7 +69,8 @@ def uncertain_parameters(compiled: Any, given: Mapping[str, float | str]) -> tup
     Args:
         compiled: the model.
         given: deviations by name: ``"friction"`` for all geoms, ``"mass[trunk]"`` for a body, ``"damping[FR_*]"`` for
-            joints whose names match; a number in SI units, or a share as ``"20 %"``.
+            joints whose names match; a number in SI units, or a share as ``"20 %"``. Without a name, a number is of the
+            joints that actuators drive, if there are any.
     """
     return tuple(_parameter(compiled, name, deviation) for name, deviation in given.items())
 
@@ -83,7 +84,7 @@ def _parameter(compiled: Any, name: str, deviation: float | str) -> MuJoCoParame
     relative = str(deviation).strip().endswith("%")
     if quantity.ratio_only and not relative:
         raise InputError(f"the deviation of {name!r} must be a share as '20 %', got {deviation!r}.")
-    rows = _rows(compiled, quantity.element, match["elements"], name)
+    rows = _rows(compiled, quantity.element, match["elements"], name, relative)
     places = []
     for field, components in quantity.fields:
         values = _values(compiled, field)
@@ -111,9 +112,12 @@ def _of_field(compiled: Any, field: str, rows: Rows) -> Rows:
     return rows
 
 
-def _rows(compiled: Any, element: str, pattern: str | None, name: str) -> Rows:
+def _rows(compiled: Any, element: str, pattern: str | None, name: str, relative: bool) -> Rows:
     if element == "model":
         return np.arange(1)
+    if element == "joint" and pattern is None and not relative and compiled.nu:
+        # What is added to all joints is not added to a floating base.
+        return np.unique(compiled.actuator_trnid[compiled.actuator_trntype == 0, 0]).astype(np.intp)
     count = {"body": compiled.nbody, "geom": compiled.ngeom, "joint": compiled.njnt, "actuator": compiled.nu}[element]
     names: Sequence[str] = [getattr(compiled, element)(k).name for k in range(count)]
     first = 1 if element == "body" else 0  # the world has no mass

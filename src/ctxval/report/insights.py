@@ -83,33 +83,6 @@ def weak_states(context: ReportContext) -> Answer | None:
     return "note", text, numbers
 
 
-def bias(context: ReportContext) -> Answer | None:
-    """How the distance of a typical task compares with the largest one, and whether S errs to one side of M."""
-    model = context.distance_model
-    if model is None or not context.distances.max() > 0:
-        return None
-    typical = float(np.mean(model.over_tasks.median))
-    share = typical / float(context.distances.max())
-    where = "nearly everywhere" if share > 0.6 else "in a part of the tasks" if share > 0.2 else "in few tasks"
-    text = (
-        f"The mean distance over all tasks is predicted to be {quantity(typical, context.labels.units)}, "
-        f"{percent(share)} of the largest executed one: M errs {where}."
-    )
-    numbers = {"mean_distance": typical, "share_of_largest": share}
-    if len(context.recordings) >= 4:
-        runs = context.recordings.values()
-        errors = np.array([run.system.final_state - run.model.final_state for run in runs])
-        spans = np.maximum(np.ptp([run.system.final_state for run in runs], axis=0), 1e-300)
-        j = int((np.abs(errors) / spans).mean(axis=0).argmax())
-        label, same = context.signals[0][j], float(max((errors[:, j] > 0).mean(), (errors[:, j] < 0).mean()))
-        text += (
-            f" At the end of the executed tasks S lies on the same side of M in {label} in {percent(same, 3)} of the "
-            "trials" + (", so the error is systematic." if same > 0.9 else ".")
-        )
-        numbers |= {"one_sided_share": same}
-    return "note", text, numbers
-
-
 def explained(context: ReportContext) -> Answer | None:
     """Whether the corrected model, learned from the other trials, predicts the distance."""
     if context.validation is None:
@@ -201,27 +174,6 @@ def flips(context: ReportContext) -> Answer | None:
     return "attention", text, values
 
 
-def unusual_motion(context: ReportContext) -> Answer | None:
-    """Whether M itself makes an unusual motion in the worst trials, such as turning over."""
-    if len(context.recordings) < 4:
-        return None
-    runs = [run.model.states for run in context.recordings.values()]
-    sizes = np.array([np.abs(states - states[0]).max(axis=0) for states in runs])
-    usual = np.maximum(np.median(sizes, axis=0), 1e-3 * sizes.max(axis=0) + 1e-300)
-    ratios = sizes[:_WORST] / usual
-    row, j = (int(k) for k in np.unravel_index(int(ratios.argmax()), ratios.shape))
-    trial, label, ratio = list(context.recordings)[row], context.signals[0][j], float(ratios[row, j])
-    if ratio < 3.0:
-        return None
-    values = {"trial": trial, "state": label, "times_the_median": ratio}
-    text = (
-        f"In trial {trial} M itself moves {number(float(sizes[row, j]))} in {label}, {number(ratio, 2)} times as far "
-        "as in the median trial: the controller asks for an unusual motion, which may explain the distance better "
-        "than an error of M."
-    )
-    return "attention", text, values
-
-
 def saturation(context: ReportContext) -> Answer | None:
     """Whether inputs stay at their limits."""
     synthesizer = None if context.validation is None else context.validation.synthesizer
@@ -277,8 +229,6 @@ INSIGHTS: dict[str, Question] = {
     "Controllers of neighbouring tasks": flips,
     "Inputs and their limits": saturation,
     "Design of the controllers": converged,
-    "Motion of M": unusual_motion,
     "Goals of M": goals,
-    "Bias across the tasks": bias,
     "Corrected model": explained,
 }

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from ctxval._util.registry import Registry
 from ctxval.searches.base import BaseSearch, Costs, Note, Prediction, Search, SequentialSearch
 from ctxval.searches.bayesian_optimisation import BayesianOptimisation
 from ctxval.searches.cma_es import CMAES
 from ctxval.searches.gp_ucb import GPUCB
 from ctxval.searches.random import Random, SamplingDiscarding
-from ctxval.searches.repeated import Repeated
 from ctxval.searches.trust_region import Auto, TrustRegion
 
 __all__ = [
@@ -25,7 +22,6 @@ __all__ = [
     "Note",
     "Prediction",
     "Random",
-    "Repeated",
     "SamplingDiscarding",
     "Search",
     "SequentialSearch",
@@ -38,14 +34,4 @@ REGISTRY: Registry[Search] = Registry("search", __name__, method="ask")
 
 DEFAULT = "auto"  #: the default search of a campaign, in Python, in experiment files and on the command line
 
-
-def by_name(name: str, *, repeats: int = 1, **options: Any) -> Search:
-    """Return a new search from its name and its options.
-
-    Args:
-        name: a name of :data:`REGISTRY`, such as ``"auto"``.
-        repeats: number of evaluations of each point; more than one if the function is noisy.
-        options: options of the search.
-    """
-    search = REGISTRY.make(name, **options)
-    return search if repeats == 1 else Repeated(search, repeats)
+by_name = REGISTRY.make

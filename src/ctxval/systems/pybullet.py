@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
-from ctxval._util.checked import NonNegativeFloat, PositiveInt, Seconds, require_known
+from ctxval._util.checked import PositiveInt, Seconds
 from ctxval._util.mjcf import compile_mjcf, digest_of, is_mjcf_text
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
@@ -24,9 +24,6 @@ from ctxval.core.trajectory import TERMINATED, Trajectory
 from ctxval.errors import InputError, ShapeError
 from ctxval.systems.episode import require_one, require_started, run_episode
 
-_FLOOR = """<robot name="floor"><link name="floor"><contact><lateral_friction value="1"/></contact>
-    <inertial><mass value="0"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>
-    <collision><geometry><plane normal="0 0 1"/></geometry></collision></link></robot>"""
 _FASTEST = 1e6  # rad/s, at which a simulation has become unstable; Bullet's own limit of joints, 100, is too low
 
 
@@ -44,12 +41,8 @@ class PyBullet:
 
     Args:
         file: a URDF file, or an MJCF file or its text. MuJoCo compiles an MJCF, and Bullet gets it as a URDF.
-        mjcf: the MJCF of M. A URDF gets its joints, actuators, gravity, timestep and fixed geoms.
-        joints: names of the joints of a URDF without ``mjcf`` in the order of the states; by default that of the file.
-        inputs: names of its joints with inputs, which are torques or forces; by default all joints.
-        kp, kd: gains with which its inputs are targets of positions.
-        free: whether its base moves freely, above a plane of height 0 with friction 1.
-        timestep: of the engine, seconds; by default that of the MJCF, or 1/240 s.
+        mjcf: the MJCF of M, for a URDF, which gets its joints, actuators, gravity, timestep and fixed geoms.
+        timestep: of the engine, seconds; by default that of the MJCF.
         substeps: number of these in one control step.
     """
 
@@ -58,31 +51,19 @@ class PyBullet:
         file: str | Path,
         *,
         mjcf: str | Path | None = None,
-        joints: Sequence[str] = (),
-        inputs: Sequence[str] = (),
-        kp: NonNegativeFloat = 0.0,
-        kd: NonNegativeFloat = 0.0,
-        free: bool = False,
         timestep: Seconds | None = None,
         substeps: PositiveInt = 1,
     ) -> None:
         require_extra("pybullet", "pybullet", "systems.PyBullet needs")
         is_urdf = not is_mjcf_text(file) and Path(file).suffix.lower() == ".urdf"
-        alone = {"joints": joints, "inputs": inputs, "kp": kp, "kd": kd, "free": free}
-        unused = [name for name, value in alone.items() if value and (mjcf is not None or not is_urdf)]
-        if unused or (mjcf is not None and not is_urdf):
-            names = ", ".join(unused) or "mjcf"
-            raise InputError(f"{names} cannot be given here: an MJCF has its own joints and actuators.")
-        self._urdf, self._model, self.substeps = Path(file).absolute() if is_urdf else None, None, substeps
+        if is_urdf == (mjcf is None):
+            raise InputError("mjcf must be given for a URDF, and only for a URDF: an MJCF has its own joints.")
+        self._urdf, self.substeps = Path(file).absolute() if is_urdf else None, substeps
         with reworded(f"the file {str(file)!r} cannot be read", InputError):
             self._described: dict[str, Any] = {"file": digest_of(file), "substeps": substeps}
-        if is_urdf and mjcf is None:
-            self._described |= alone
-            self._robot = _of_urdf(Path(file), joints, inputs, kp, kd, free)
-        else:
-            self._described["mjcf"], self._model = compile_mjcf(file if mjcf is None else mjcf)
-            self._robot = _of_mjcf(self._model, named=is_urdf)
-        self.timestep = timestep or (1 / 240 if self._model is None else float(self._model.opt.timestep))
+        self._described["mjcf"], self._model = compile_mjcf(file if mjcf is None else mjcf)
+        self._robot = _of_mjcf(self._model, named=is_urdf)
+        self.timestep = timestep or float(self._model.opt.timestep)
         self._idle = [self._made()]  # each execution takes its own, so that threads do not share one
 
     @property
@@ -120,13 +101,10 @@ class PyBullet:
             self._idle.append(engine)
 
     def _made(self) -> _Engine:
-        model, trees = self._model, []
-        engine = _Engine(self.timestep, (0.0, 0.0, -9.81) if model is None else model.opt.gravity)
+        model = self._model
+        engine = _Engine(self.timestep, model.opt.gravity)
         with tempfile.TemporaryDirectory() as folder:
-            if model is not None:
-                trees = [tree for tree in trees_of(model, Path(folder)) if self._urdf is None or tree.is_geom]
-            elif self._robot.free:
-                trees = [Tree(_FLOOR)]
+            trees = (tree for tree in trees_of(model, Path(folder)) if self._urdf is None or tree.is_geom)
             for k, tree in enumerate(trees):
                 path = Path(folder) / f"{k}.urdf"
                 path.write_text(tree.urdf, encoding="ascii")
@@ -208,34 +186,6 @@ def _of_mjcf(model: Any, named: bool) -> _Robot:
         gain=np.where(affine, model.actuator_gainprm[:, :3], 0.0),
         bias=np.where((model.actuator_biastype == 1)[:, None], model.actuator_biasprm[:, :3], 0.0),
         ranges=np.where(limited, ranges, np.broadcast_to([-np.inf, np.inf], (acts, 2, 2))),
-    )
-
-
-def _of_urdf(path: Path, joints: Sequence[str], inputs: Sequence[str], kp: float, kd: float, free: bool) -> _Robot:
-    """Return states and inputs by the names of joints in a URDF."""
-    probe = _Engine(1.0, (0.0, 0.0, 0.0))
-    probe.load(path, Tree(""))
-    limits = {name: float(info[10]) for name, (_, info) in probe.joints.items()}
-    names, driven = tuple(joints or limits), tuple(inputs or joints or limits)
-    require_known("joint", (*names, *driven), tuple(limits))
-    n, m, first = len(names), len(driven), 7 * free
-    servo, nq = bool(kp or kd), n + 7 * free
-    effort = np.array([limits[name] or np.inf for name in names])
-    return _Robot(
-        names,
-        first + np.arange(n),
-        nq + 6 * free + np.arange(n),
-        ((0, nq),) if free else (),
-        nq,
-        zeros=np.zeros(n),
-        stiffness=np.zeros(n),
-        rests=np.zeros(n),
-        most=effort,
-        driven=np.array([names.index(name) for name in driven], dtype=np.intp),
-        gear=np.ones(m),
-        gain=np.tile([kp if servo else 1.0, 0.0, 0.0], (m, 1)),
-        bias=np.tile([0.0, -kp, -kd], (m, 1)),
-        ranges=np.broadcast_to([-np.inf, np.inf], (m, 2, 2)),
     )
 
 

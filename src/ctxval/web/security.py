@@ -204,10 +204,8 @@ class Guard:
             await HTMLResponse(page, refused[0], {"Connection": "close"})(scope, receive, guarded)
 
     def _most(self, scope: Scope) -> int:
-        """Return the largest size of a request; one of a session lets its connection wait no longer."""
+        """Return the largest size of a request."""
         known = self.access.session(HTTPConnection(scope).cookies) is not None
-        if known and (connection := scope.get("state", {}).get("connection")) is not None:
-            connection.waiting.remove(connection)
         if scope["path"] == "/enter" or not (known or not self.access.needs_token):
             return 2**12
         return MOST_UPLOAD if scope["path"].endswith("/recording") else 2**18

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import secrets
 import socket
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from types import FrameType
-from typing import Any
 
 import uvicorn
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ctxval._util.refusals import reworded
 from ctxval.errors import InputError
@@ -82,10 +77,9 @@ class Server(uvicorn.Server):
             access_log=False,  # an address may contain the token
             server_header=False,
             proxy_headers=False,
-            limit_concurrency=256,  # requests and open pages
             timeout_graceful_shutdown=5,
             lifespan="on",
-            http=partial(Connection, Waiting()),  # type: ignore[arg-type]
+            http="h11",  # which limits the size of headers
             ws="none",
         )
         super().__init__(config)
@@ -113,50 +107,3 @@ def page_address(host: str, port: int) -> str:
     """Return the address of the page for a browser; a wildcard becomes the name of this computer."""
     name = socket.gethostname() if host in ("0.0.0.0", "::", "") else host
     return f"http://[{name}]:{port}/" if ":" in name else f"http://{name}:{port}/"
-
-
-class Waiting:
-    """The connections without a request of a session, in the order in which they began to wait.
-
-    If there are too many, the oldest one of the address with the most ends. A browser sends its request at once.
-    """
-
-    def __init__(self) -> None:
-        self._ends: dict[Connection, asyncio.TimerHandle] = {}
-
-    def add(self, connection: Connection) -> None:
-        self.remove(connection)
-        self._ends[connection] = connection.loop.call_later(10.0, connection.transport.abort)
-        if len(self._ends) > 128:
-            ((busiest, _),) = Counter(waiting.client and waiting.client[0] for waiting in self._ends).most_common(1)
-            oldest = next(waiting for waiting in self._ends if (waiting.client and waiting.client[0]) == busiest)
-            self.remove(oldest)
-            oldest.transport.abort()
-
-    def remove(self, connection: Connection) -> None:
-        """Let a connection go on: it has a request of a session, or has ended."""
-        ends = self._ends.pop(connection, None)
-        if ends is not None:
-            ends.cancel()
-
-
-class Connection(H11Protocol):
-    """A connection, which the application finds as ``scope["state"]["connection"]``; h11 limits the size of headers."""
-
-    def __init__(self, waiting: Waiting, **options: Any) -> None:
-        super().__init__(**options)
-        self.waiting = waiting
-        self.app_state = {**self.app_state, "connection": self}
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
-        self.waiting.add(self)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self.waiting.remove(self)
-        super().connection_lost(exc)
-
-    def on_response_complete(self) -> None:
-        if not self.transport.is_closing():
-            self.waiting.add(self)
-        super().on_response_complete()

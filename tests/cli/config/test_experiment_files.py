@@ -213,7 +213,6 @@ def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
             'kind = "audit"\nresolution = 0.3',
             ("resolution", "kind", "auto"),
         ),
-        ("repeats = 1", "repeats = 0", ("search.repeats",)),
         ("components = [0]", "componets = [0]", ("components",)),
         ('type = "auto"', 'type = "gp-ucb"\nbeta = "two"', ("gp-ucb", "beta")),
         ('type = "auto"', 'type = "gp-ucb"\ninitial = 2.5', ("gp-ucb", "initial")),

@@ -156,7 +156,7 @@ ATTACKS: dict[str, dict[str, Any]] = {
     "environment": {**PLAIN, "system": {"type": "Gymnasium", "environment": "evil:Environment-v0"}},
     "fmu": {**PLAIN, "system": {"type": "FMU", "source": "evil.fmu", "states": {"x": ""}, "inputs": {"u": ""}}},
     "installed distance": {**PLAIN, "distance": {"type": "Speed"}},
-    "installed search": {**PLAIN, "search": {"type": "corners", "repeats": 1}},
+    "installed search": {**PLAIN, "search": {"type": "corners"}},
     "installed case": {"experiment": "swing"},
     "folder": {**PLAIN, "task": {"ref": "evil:task"}, "folder": "."},
     "deep": {**PLAIN, "system": {"type": "Simulated", "step": [[{"a": [{"ref": "evil:step"}]}]]}},
@@ -379,35 +379,9 @@ def test_what_the_user_names_may_be_of_an_installed_package(site: Path) -> None:
     done("ask", "a.sqlite")  # it is the user's own store
     shutil.rmtree(allowed_folder())
     said = refusal("ask", "a.sqlite")  # it is not any more
-    assert "distance = {'type': 'Speed'}; search = {'repeats': 1, 'type': 'corners'}" in said
+    assert "distance = {'type': 'Speed'}; search = {'type': 'corners'}" in said
     done("ask", "a.sqlite", "--trust")
     done("ask", "a.sqlite")
-
-
-def test_cases_of_installed_packages_are_listed_with_their_options(site: Path) -> None:
-    said = done("cases").stdout
-    assert_names(said, "swing", "pendulum", "size", "options")
-    assert json.loads(done("cases", "swing", "--json").stdout)["options"] == {"size": 1}
-    assert "case 'swing': size" in refusal("run", "swing", "--option", "size=large")
-    (site / "their_parts.py").write_text("1 / 0")
-    sys.modules.pop("their_parts")
-    assert_names(" ".join(done("cases").stdout.split()), "their_parts:swing", "ZeroDivisionError")
-    assert "pendulum" in done("cases").stdout
-    refusal("cases", "swing")
-
-
-@pytest.mark.parametrize(
-    ("code", "facts"),
-    [
-        ("swing = dict", ("swing",)),
-        ("def swing(seed, size: '1 / 0' = 2): ...", ("size", 2)),
-    ],
-)
-def test_a_case_that_cannot_be_inspected_hides_no_other_one(code: str, facts: tuple[object, ...], site: Path) -> None:
-    (site / "their_parts.py").write_text(code)
-    listed = " ".join(done("cases").stdout.split())
-    assert_names(listed, *facts)
-    assert "pendulum" in listed
 
 
 # Naming the experiment again

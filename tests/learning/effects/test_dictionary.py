@@ -76,7 +76,7 @@ def test_draws_run_together_as_alone(model: Model, n: int, m: int) -> None:
     fixed = {"ObservationDelay", "WrappedAngle", "Effect"}  # sizes that are counted
     fixed |= {"JointStop", "RunOffset"}  # nothing stops, and there is one run
     # A constant force on a driven joint is an offset of its input.
-    of_mujoco = {"JointAttribute", "BodyMass", "MassCentre"}
+    of_mujoco = {"JointAttribute", "BodyMass", "MassCentre", "SharedAttribute"}
     assert m == 1 or seen == {kind.__name__ for kind in kinds()} - fixed - of_mujoco - {"Bias"}
 
 

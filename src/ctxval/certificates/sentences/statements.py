@@ -20,6 +20,7 @@ from ctxval.certificates.bounds import (
 )
 from ctxval.certificates.evidence import Evidence
 from ctxval.certificates.sample import Sample, listed
+from ctxval.core.target import Quantile, Share
 
 if TYPE_CHECKING:
     from ctxval.certificates.envelope import Envelope
@@ -172,11 +173,12 @@ def dynamics_statement(upper: float, error: float, confidence: float, evidence: 
     law = "the posterior of M's uncertain parameters" if evidence.is_parametric else law
     shown = f"{upper:.6g}" if evidence.negligible else with_error(upper, error)
     bound, what = f"With {percent(confidence)} probability under {law}", f"d* is at most {shown}"
-    if evidence.quantile is not None:
-        which = f"the {evidence.quantile:g} quantile of the distance"
-        return f"{bound} with noise, {which} is at most {with_error(upper, error)} in every task."
-    if evidence.share < 1:
-        what = f"the distances of {100 * evidence.share:.4g} % of the tasks are at most {shown}"
+    match evidence.target:
+        case Quantile(quantile=quantile):
+            which = f"the {quantile:g} quantile of the distance"
+            return f"{bound} with noise, {which} is at most {with_error(upper, error)} in every task."
+        case Share(share=share):
+            what = f"the distances of {100 * share:.4g} % of the tasks are at most {shown}"
     return f"If {SMALL_ERRORS}, {what}." if evidence.negligible else f"{bound}, {what}."
 
 
@@ -223,11 +225,11 @@ def dynamics_assumptions(evidence: Evidence) -> tuple[str, ...]:
     steps = "the last record" if not evidence.lags else f"the last {evidence.lags + 1} records"
     state = f"{'' if evidence.estimated else 'the '}{state_of(evidence.estimated)}"
     complete = f"{state} is complete: the next state depends on it and on the input alone"
-    if evidence.lags or evidence.quantile is not None:
+    if evidence.lags or evidence.target.is_noisy:
         complete = f"the next record depends on {steps} and inputs alone, up to noise"
     but = except_for(evidence.physical)
     alike = f"the system is deterministic, and its dynamics do not change with time or with the task{but}"
-    if evidence.quantile is not None:
+    if evidence.target.is_noisy:
         alike = (
             "noise is independent from step to step, like that of the records, and the dynamics do not change with "
             f"time or with the task{but}"
@@ -237,7 +239,7 @@ def dynamics_assumptions(evidence: Evidence) -> tuple[str, ...]:
         f"the search of {evidence.evaluations} closed loops on the learned dynamics found the largest distance of each "
         "posterior sample"
     )
-    if evidence.share < 1:
+    if evidence.target.share < 1:
         searched = (
             f"the shares of tasks follow from {evidence.evaluations} closed loops of randomly drawn tasks, which "
             "exaggerate each posterior sample's distance with a probability of 99 %"
@@ -328,7 +330,7 @@ def whole_suite_statement(trusted: int, tasks: int, threshold: float, units: str
 def envelope_statement(envelope: Envelope) -> str:
     """Return what an envelope says, why it is not larger, and what nothing has checked."""
     limit = f"{at_most(envelope.threshold)} {envelope.units}".rstrip()
-    what = "d" if envelope.quantile is None else f"the {envelope.quantile:g} quantile of d"
+    what = f"the {envelope.target.quantile:g} quantile of d" if envelope.target.is_noisy else "d"
     size = f"{100 * envelope.share:.2g} % of the tasks" if envelope.tasks is None else f"{len(envelope.tasks)} tasks"
     tasks = f"all tasks of a set of {size}" if envelope.share else "no task that can be named"
     sentences = [f"With {percent(envelope.confidence)} confidence, {what} stays below {limit} on {tasks}."]

@@ -44,9 +44,16 @@ if TYPE_CHECKING:
 
 
 def falsified(
-    worst: Trial, trials: Sequence[Trial], tau: float, quantities: Quantities, bets: Bets | None, confidence: float
+    worst: Trial,
+    trials: Sequence[Trial],
+    tau: float,
+    quantities: Quantities,
+    bets: Bets | ShareBets | None,
+    confidence: float,
 ) -> str:
     """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it."""
+    if isinstance(bets, ShareBets):
+        return _share_falsified(worst, tau, quantities, bets, confidence)
     if worst.ended_alone is not None:
         what = f"S ended after {worst.ended_alone:.3g} s ({quoted(worst.failure or '')}) and M did not"
         where = quantities.task(worst).removeprefix("task ")
@@ -80,13 +87,11 @@ def falsified(
     )
 
 
-def share_falsified(
-    worst: Trial, tau: float, quantities: Quantities, bets: ShareBets, share: float, confidence: float
-) -> str:
+def _share_falsified(worst: Trial, tau: float, quantities: Quantities, bets: ShareBets, confidence: float) -> str:
     """Return which share of the tasks exceeds a threshold, as executions alone show, and the largest of them."""
     return (
         f"with {percent(confidence)} confidence, more than {100 * bets.least:.3g} % of the tasks exceed "
-        f"{quantities.of(f'{tau:.6g}')}, and at most {100 * (1 - share):.3g} % may: {bets.above} of "
+        f"{quantities.of(f'{tau:.6g}')}, and at most {100 * (1 - bets.share):.3g} % may: {bets.above} of "
         f"{counted(bets.executions, 'execution')} at drawn tasks exceed it (e-value {bets.wealth:.3g}, where "
         f"{_needed(confidence)}). This rests on no model, only on the threshold being fixed before they were drawn; "
         f"the largest distance is {quantities.of(f'{worst.least:.4g}')} in trial {worst.number}, in the task "

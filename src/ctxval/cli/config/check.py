@@ -237,7 +237,7 @@ def _batches(validation: Validation, plans: Sequence[Plan]) -> Findings:
     with suppress(Exception):
         batch = validation.task_at(validation.space.parameters(points))
     if batch is None or batch.batch_shape != (len(points),):
-        yield "noted", "the task function takes one point at a time, so --truth is slower"
+        yield "noted", "the task function takes one point at a time, so searches are slower"
         return
     for index, plan in enumerate(plans):
         for name in ("reference", "initial_state"):
@@ -264,7 +264,7 @@ def _distance(experiment: Experiment, plans: Sequence[Plan]) -> Findings:
     except Exception:
         for plan in plans:
             validation.measure(plan, plan.model_trajectory)
-        yield "noted", "the distance takes one task at a time, so --truth is slower"
+        yield "noted", "the distance takes one task at a time, so searches are slower"
     largest = max(validation.measure(plan, plan.model_trajectory) for plan in plans)
     if largest > 0:
         yield "noted", f"the distance between a trajectory and itself is up to {largest:.3g}, not 0"

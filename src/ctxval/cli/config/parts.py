@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 from ctxval import Experiment, Parameters, TaskSpace, Transitions, cases, controllers, distances, models, systems
 from ctxval._util.checked import require, require_known
@@ -229,16 +229,3 @@ def named_experiment(text: str, seed: int, options: dict[str, Any], folder: Path
         kinds = "an Experiment or a Validation, or a function that makes one, of a seed if it needs one"
         raise InputError(f"{text} must be {kinds}, got {type(experiment).__name__}.")
     return experiment
-
-
-def plain_options(case: str) -> dict[str, Any]:
-    """Return the options of a case that a file can set, with their defaults; None for one that must be given."""
-    hints, made = dict[str, Any](), cases.REGISTRY.find(case)
-    with suppress(Exception):  # annotations that are texts are evaluated, and anything may stand in them
-        hints = get_type_hints(made)
-
-    def is_plain(hint: Any) -> bool:
-        return get_origin(hint) is Literal or bool({hint, *get_args(hint)} & {str, int, float, bool})
-
-    options = {name: default for name, default in cases.options_of(case).items() if is_plain(hints.get(name, str))}
-    return {name: None if default is inspect.Parameter.empty else default for name, default in options.items()}

@@ -80,7 +80,6 @@ class SearchTable(BaseModel, extra="allow"):
     """The table ``[search]``: the type of a search, and its options."""
 
     type: str = searches.DEFAULT
-    repeats: int = Field(default=1, ge=1)
 
     @model_validator(mode="before")
     @classmethod
@@ -92,7 +91,7 @@ class SearchTable(BaseModel, extra="allow"):
     def build(self, folder: Path | None = None) -> searches.Search:
         options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
         options = require_types(f"search {self.type!r}", searches.REGISTRY.find(self.type), options)
-        return searches.by_name(self.type, repeats=self.repeats, **options)
+        return searches.by_name(self.type, **options)
 
 
 class Aspect1Table(BaseModel, extra="forbid"):

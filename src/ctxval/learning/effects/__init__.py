@@ -9,7 +9,7 @@ from ctxval.learning.effects.gain import InputGain, ReversedInput, SwappedInputs
 from ctxval.learning.effects.inertia import Gravity, Inertia
 from ctxval.learning.effects.joint_stop import JointStop
 from ctxval.learning.effects.model import ModelWithEffects
-from ctxval.learning.effects.mujoco import BodyMass, JointAttribute, MassCentre
+from ctxval.learning.effects.mujoco import BodyMass, JointAttribute, MassCentre, SharedAttribute
 from ctxval.learning.effects.plant import Joint
 from ctxval.learning.effects.run_offset import RunOffset
 from ctxval.learning.effects.saturation import RateLimit, Saturation
@@ -48,6 +48,7 @@ __all__ = [
     "Saturation",
     "SensorOffset",
     "SensorScale",
+    "SharedAttribute",
     "Stribeck",
     "SwappedInputs",
     "SwappedJoints",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -10,8 +11,10 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.core.model import Model
+from ctxval.errors import InputError
 from ctxval.learning.effects.effect import Effect, EffectCandidate, Observed, Parameter, of_ratio, of_size
 from ctxval.learning.effects.plant import Joint, Plant
+from ctxval.models.mujoco_parameters import drawn_fields, uncertain_parameters
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,62 @@ class JointAttribute(OfMuJoCo):
         if self.attribute != "armature":
             lines["urdf"] = f'<dynamics {self.attribute.removesuffix("loss")}="{value:.5g}"/>'
         return lines
+
+
+@dataclass(frozen=True)
+class SharedAttribute(OfMuJoCo):
+    """An attribute of many elements differs. Size: the factor of its values, or what is added to them, in SI units."""
+
+    name: ClassVar[str] = "shared attribute"
+    parameter: str = "friction"  #: a name of an uncertain parameter, as :class:`ctxval.models.MuJoCo` takes it
+    added: bool = False  #: whether the size is added
+
+    @classmethod
+    def candidates(cls, observed: Observed) -> Iterator[EffectCandidate]:
+        plant, compiled = observed.plant, observed.plant.compiled
+        if compiled is None:
+            return
+        touches = bool(compiled.geom_contype.any() and compiled.geom_conaffinity.any())
+        # Of one element, other effects of the dictionary are the same; without ground, sensors are as likely tilted.
+        several = {"friction"} if touches else set[str]()
+        several |= {"damping", "armature", "stiffness"} if len(plant.joints) > 1 else set()
+        several |= {"gain"} if compiled.actuator_biasprm.any() else set()
+        own = [each.name for each in plant.model.uncertain if "[" in each.name]  # type: ignore[attr-defined]
+        for name in dict.fromkeys((*sorted(several), *own)):
+            with suppress(InputError):  # its values are 0
+                uncertain_parameters(compiled, {name: "10 %"})
+                if not name.startswith(("mass", "centre")):
+                    yield of_ratio(cls((1.0,), name))
+        inertias = _inertias(compiled)
+        forces = [
+            float(inertias[joint.dof] * observed.missed[joint.rate] / plant.dt)
+            for joint in plant.joints
+            if joint.input is not None
+        ]
+        if len(forces) > 1 and max(forces) > 0:
+            size = float(np.median(forces))
+            parameter = Parameter("friction loss", 0.0, 20 * max(forces), 0.05 * max(size, 1e-9))
+            yield of_size(cls((0.0,), "frictionloss", True), parameter, 0.3 * size, size)
+        most = float(np.linalg.norm(compiled.opt.gravity))
+        for axis in "xy" if touches and most > 0 else "":
+            tilt = Parameter("gravity", -0.5 * most, 0.5 * most, 0.01 * most, "m/s^2")
+            yield of_size(cls((0.0,), f"gravity_{axis}", True), tilt, 0.0)
+
+    def change(self, compiled: Any) -> None:
+        parameters = uncertain_parameters(compiled, {self.parameter: 1.0 if self.added else "100 %"})
+        z = np.array([[self.sizes[0] if self.added else np.log(self.sizes[0])]])
+        for field, values in drawn_fields(compiled, parameters, z).items():
+            target = compiled.opt.gravity if field == "opt.gravity" else getattr(compiled, field)
+            target[:] = values[0]
+
+    def sentence(self, plant: Plant) -> str:
+        size, axis = self.sizes[0], self.parameter[-1]
+        if self.parameter.startswith("gravity"):
+            slope = np.degrees(np.arctan(size / np.linalg.norm(plant.compiled.opt.gravity)))
+            return f"gravity has a part of {size:.3g} m/s^2 along {axis}, as on a slope of {abs(slope):.2g} degrees"
+        if self.added:
+            return f"all driven joints stick ({size:.3g} N m)"
+        return f"{self.parameter} is {size:.3g} times that of M"
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ NAMES: dict[str, str] = {
 }
 """The cases of this package, each the function ``experiment`` of the module of its name, and what each is."""
 
-__all__ = ["NAMES", "REGISTRY", "by_name", "options_of", "text_of"]
+__all__ = ["NAMES", "REGISTRY", "by_name", "options_of"]
 
 REGISTRY: Registry[Experiment] = Registry(
     "case", "ctxval.cases", modules={name: f"{__name__}.{name.replace('-', '_')}:experiment" for name in NAMES}
@@ -47,8 +47,3 @@ def options_of(name: str) -> dict[str, Any]:
         raise InputError(f"the case {name!r} must be a function of a seed and its options: {error}.") from error
     variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     return {parameter.name: parameter.default for parameter in parameters if parameter.kind not in variadic}
-
-
-def text_of(name: str) -> str:
-    """Return what a case is, in a few words."""
-    return NAMES[name] if name in NAMES else REGISTRY.summary(name)

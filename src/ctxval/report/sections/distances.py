@@ -64,10 +64,11 @@ def _estimated(context: ReportContext, unit: Array) -> Band | None:
     errors = np.array([replay.distance - context.recordings[k].distance for k, replay in context.replays.items()])
     if model is None or (errors**2).mean() <= ((model.left_out.median - model.values) ** 2).mean():
         # The user's parts, at states that no execution has reached, must not end a report.
-        with suppress(Exception), stage("predicting distances", len(unit), "tasks"):
-            values = dynamics.expected(context.trials, unit, len(context.trials))
-            if np.isfinite(values).any():
-                return Band(values, values, values)
+        with suppress(Exception), stage("predicting distances", len(unit), "tasks"), context.thinks():
+            if dynamics.affords(context.trials, len(unit)):
+                values = dynamics.expected(context.trials, unit, len(context.trials))
+                if np.isfinite(values).any():
+                    return Band(values, values, values)
     return None if model is None else model.predict(unit)
 
 
