@@ -340,21 +340,21 @@ class DynamicsStudy(ShortRepr):
         records show. In closed loops, errors that such a history makes itself tell nothing, and loops may diverge.
         """
         noisy, settings = self.noise.learn(posterior, self.extended.records(executed), ledger), self.settings.noise
-        if noisy is None or noisy.noise > settings.exact:
-            return noisy
+        if noisy is None or noisy.noise > settings.exact or self.given.outputs is not None:
+            return noisy  # estimates of states from outputs need histories
         pool = self.search.pool[: settings.batched_pool if self.planner.batched else settings.pool]
         points = np.array([*(point for point, _ in executed), *pool])
-        planned = self.planner.plan(points)
+        planned, count = self.planner.plan(points), len(executed)
         with single_threaded(), np.errstate(all="ignore"):
+            of_system = np.array([self.planner.distance_of(*each) for each in executed])
             without, with_it = (
-                np.nan_to_num(self.planner.distances(each.mean, planned, len(points))[0], nan=np.inf)
+                np.nan_to_num(self.planner.distances(each.mean, planned, len(points))[0], nan=0.0, posinf=np.inf)
                 for each in (posterior, noisy)
             )
-        at_executed = slice(len(executed))
-        largest = without[at_executed].max()
-        reproduced = np.abs(with_it - without)[at_executed].max() <= settings.reproduced * largest
-        converges = with_it.max() <= settings.diverged * without.max()
-        return noisy if (reproduced and converges) or not np.isfinite(without).all() else None
+            errors, errors_without = (np.abs(each[:count] - of_system).max() for each in (with_it, without))
+        diverges = with_it.max() > settings.diverged * max(without.max(), of_system.max())
+        misses = errors > max(settings.reproduced * of_system.max(), errors_without)
+        return None if diverges or misses else noisy
 
     @functools.cached_property
     def noise(self) -> NoiseStudy:
