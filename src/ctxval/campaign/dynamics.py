@@ -382,7 +382,7 @@ class CampaignDynamics:
             scatter=learned.scatter if learned.predicts_distributions else 0.0,
             physical=learned.study.given.physical,
             without_data=not learned.with_data,
-            estimated=learned.study.given.outputs is not None,
+            estimated=learned.study.given.outputs.hide_states,
             negligible=learned.negligible,
             best=Trials(trials).largest,
             worst=() if (largest := Trials(trials).worst) is None else tuple(largest.unit_point.tolist()),

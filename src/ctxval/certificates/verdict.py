@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from ctxval._util.checked import PositiveFloat, checked, require
-from ctxval._util.representation import ShortRepr, call, line, lines, shown
+from ctxval._util.representation import ShortRepr, Shown, call, line
 from ctxval.certificates.base import KINDS, Certificate, CertificateKind
 from ctxval.certificates.bets import Bets, bets_against
 from ctxval.certificates.bounds import NO_UNITS, Quantities
@@ -52,13 +52,8 @@ class Verdict:
         return f"{self.answer}: {self.reason}" + (f" {self.rests_on}" if self.rests_on else "")
 
     def __repr__(self) -> str:
-        head = call(self, self.answer, threshold=self.threshold)
-        if self.rests_on:
-            # The text of a verdict has both sentences whole.
-            return "\n  ".join([head, f"reason: {line(self.reason, 180)}", line(self.rests_on, 330)])
-        parts = {"witness": self.witness, "certificate": self.certificate, "expected": self.expected}
-        known = (f"{name}: {shown(part)}" for name, part in parts.items() if part is not None)
-        return lines(head, f"reason: {line(self.reason)}", *known)
+        text = call(self, self.answer, threshold=self.threshold, reason=Shown(line(self.reason)))
+        return f"{text}\n  {line(self.rests_on, 330)}" if self.rests_on else text
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer and its reasons, ready for JSON; the certificate has its own."""

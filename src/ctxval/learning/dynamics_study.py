@@ -95,7 +95,7 @@ class DynamicsStudy(ShortRepr):
         self.extended = ExtendedValidation(validation, of_inputs) if extended is None else extended
         self.validation = self.extended.validation
         self.planner = LoopPlanner(self.validation, of_inputs)
-        self._errors = ErrorVectors(self.planner if validation.outputs is None else LoopPlanner(validation))
+        self._errors = ErrorVectors(LoopPlanner(validation) if validation.outputs.hide_states else self.planner)
         self._covariances = Latest[bytes, LearnedCovariances | None](8)
         self._effects_of = Latest[bytes, Found](8)
         self._made = Latest[tuple[object, ...], DynamicsStudy](8)

@@ -311,7 +311,7 @@ class LearnedDynamics(ShortRepr):
     def positions(self) -> list[list[int]]:
         """Of each position that tasks choose, the two states that are its coordinates; a suite has no other tasks."""
         study, search = self.study, self.search
-        space, goals = study.validation.space, study.given.outputs is None
+        space, goals = study.validation.space, not study.given.outputs.hide_states
         labels = self.labels[: len(self.posterior.data.sizes)]
         return position_states(space, labels, search.plans, search.pool, goals=goals) if space.members is None else []
 

@@ -121,7 +121,8 @@ class NoiseStudy:
         # and no part of the dynamics that is not learned. Estimates of states deviate without noise, too.
         n = len(posterior.data.sizes)
         scatters = _scatter_of(records)[:n] > settings.rounding * posterior.data.scale[:n]
-        is_measured = self.extended.given.outputs is None and noisy.noise > settings.noisy and bool(scatters.any())
+        hidden = self.extended.given.outputs.hide_states
+        is_measured = not hidden and noisy.noise > settings.noisy and bool(scatters.any())
         return noisy if is_measured or self._effect(noisy) > settings.matters else replace(noisy, replicates=1)
 
     def _within(self, ledger: Ledger) -> tuple[Structure, ...]:

@@ -111,7 +111,7 @@ def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Findings:
     plans.extend([validation.plan(point) for point in points])
     task, on_model = plans[0].task, plans[0].model_trajectory
     n, recorded = task.initial_state.shape[-1], on_model.states.shape[-1]
-    states = f"{n} states" if validation.outputs is None else f"{recorded} outputs of {n} states"
+    states = f"{recorded} outputs of {n} states" if validation.outputs.hide_states else f"{n} states"
     sizes = f"{states}, {on_model.inputs.shape[-1]} inputs"
     yield "ok", f"{len(plans)} tasks planned: {sizes}, {task.horizon} steps of {task.dt:g} s"
     require_repeatable(validation, plans[0])
