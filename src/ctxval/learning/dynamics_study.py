@@ -340,7 +340,7 @@ class DynamicsStudy(ShortRepr):
         records show. In closed loops, errors that such a history makes itself tell nothing, and loops may diverge.
         """
         noisy, settings = self.noise.learn(posterior, self.extended.records(executed), ledger), self.settings.noise
-        if noisy is None or noisy.noise > settings.exact or self.given.outputs is not None:
+        if noisy is None or noisy.noise > settings.exact or self.given.outputs.hide_states:
             return noisy  # estimates of states from outputs need histories
         pool = self.search.pool[: settings.batched_pool if self.planner.batched else settings.pool]
         points = np.array([*(point for point, _ in executed), *pool])
