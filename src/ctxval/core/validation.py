@@ -367,7 +367,7 @@ class Validation:
         require_time_step(self.model, task.dt, "the task")
         if task.horizon > self.longest or (task.horizon > self.cost_stated_from and self not in _stated):
             self._state_cost(parameters, task)
-        return task if self.space.members is None else task.named(self.space.task_names_at(parameters.points))
+        return self.space.named(task, parameters.points)
 
     def _state_cost(self, parameters: Parameters, task: Task) -> None:
         """State the cost of a long horizon once, from the first steps of a plan; refuse one that is too long."""

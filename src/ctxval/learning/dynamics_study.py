@@ -21,12 +21,19 @@ from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.closed_loops import LoopPlanner, unseen_parameters
 from ctxval.learning.dry_friction import DryFriction
-from ctxval.learning.dynamics_posterior import LearnedCovariances, PosteriorSettings, condition, learn_covariances
+from ctxval.learning.dynamics_posterior import (
+    DynamicsPosterior,
+    LearnedCovariances,
+    PosteriorSettings,
+    condition,
+    learn_covariances,
+)
 from ctxval.learning.effects.inputs import InputEffects
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.input_effects import Found, input_candidates
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import NoiseSettings, NoiseStudy
+from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.parametric_dynamics import ParametricDynamics, ParametricSettings, learned_parameters
 from ctxval.learning.precision import AgreeingDynamics, AgreementSettings, agreeing_posterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
@@ -324,8 +331,31 @@ class DynamicsStudy(ShortRepr):
         loops = [trajectory for _, trajectory in executed]
         return LearnedDynamics(
             self, posterior, points, loops, with_data, ledger=Ledger() if ledger is None else ledger,
-            learn_noisy=lambda ledger: self.noise.learn(posterior, self.extended.records(executed), ledger),
+            learn_noisy=lambda ledger: self._noisy(posterior, executed, ledger),
         )  # fmt: skip
+
+    def _noisy(self, posterior: DynamicsPosterior, executed: Executed, ledger: Ledger) -> NoisyPosterior | None:
+        """Return dynamics with noise and histories; None without any, or if their closed loops contradict executions.
+
+        Along each record, earlier errors of M tell the next one even if it is a function of state and input that few
+        records show. In closed loops, errors that such a history makes itself tell nothing, and loops may diverge.
+        """
+        noisy, settings = self.noise.learn(posterior, self.extended.records(executed), ledger), self.settings.noise
+        if noisy is None or noisy.noise > settings.exact or self.given.outputs.hide_states:
+            return noisy  # estimates of states from outputs need histories
+        pool = self.search.pool[: settings.batched_pool if self.planner.batched else settings.pool]
+        points = np.array([*(point for point, _ in executed), *pool])
+        planned, count = self.planner.plan(points), len(executed)
+        with single_threaded(), np.errstate(all="ignore"):
+            of_system = np.array([self.planner.distance_of(*each) for each in executed])
+            without, with_it = (
+                np.nan_to_num(self.planner.distances(each.mean, planned, len(points))[0], nan=0.0, posinf=np.inf)
+                for each in (posterior, noisy)
+            )
+            errors, errors_without = (np.abs(each[:count] - of_system).max() for each in (with_it, without))
+        diverges = with_it.max() > settings.diverged * max(without.max(), of_system.max())
+        misses = errors > max(settings.reproduced * of_system.max(), errors_without)
+        return None if diverges or misses else noisy
 
     @functools.cached_property
     def noise(self) -> NoiseStudy:

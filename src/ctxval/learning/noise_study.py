@@ -45,7 +45,10 @@ class NoiseSettings:
     rounding: float = 1e-5  # standard deviation, as a share of a state's, below which it is rounding
     history_error: float = 0.1  # share of the error without a history that a history leaves at most
     history_residual: float = 0.02  # the same, as a share of the residual
+    reproduced: float = 0.2  # error of executed distances by an exact history, as a share of the largest one
+    diverged: float = 10.0  # multiple of the largest distance without it from which its closed loops diverge
     pool: int = 32  # tasks of the pool among which those with the largest distances show what noise does
+    batched_pool: int = 256  # tasks of the pool whose closed loops must not diverge, if they run together
     tasks: int = 6  # number of these tasks
     runs: int = 10  # how often each of them is run
     replicates: int = 10  # sequences of noise of each draw in a search
