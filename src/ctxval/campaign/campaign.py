@@ -701,5 +701,5 @@ class Campaign:
         return completed.points(self.validation.space.dimension), completed.distances
 
     def __repr__(self) -> str:
-        head = call(self, self.validation.space, name=self.name or None, seed=self.seed)
-        return display.as_text(head, self.recorder)
+        known = {"trials": len(self.trials), "worst": self.worst and self.worst.distance, "store": self.store}
+        return call(self, self.validation.space, name=self.name or None, seed=self.seed, **known)

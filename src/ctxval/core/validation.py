@@ -18,7 +18,7 @@ from ctxval._util.checked import NonNegativeFloat, PositiveInt, checked
 from ctxval._util.cores import raised_by_signal
 from ctxval._util.describe import describe, without_numbers
 from ctxval._util.progress import advance
-from ctxval._util.representation import call, lines, shown
+from ctxval._util.representation import call, name_of
 from ctxval._util.texts import parted, reason_of
 from ctxval.core.controller import Controller, Synthesizer, is_controller
 from ctxval.core.distance import Distance
@@ -367,7 +367,7 @@ class Validation:
         require_time_step(self.model, task.dt, "the task")
         if task.horizon > self.longest or (task.horizon > self.cost_stated_from and self not in _stated):
             self._state_cost(parameters, task)
-        return task if self.space.members is None else task.named(self.space.task_names_at(parameters.points))
+        return self.space.named(task, parameters.points)
 
     def _state_cost(self, parameters: Parameters, task: Task) -> None:
         """State the cost of a long horizon once, from the first steps of a plan; refuse one that is too long."""
@@ -389,13 +389,8 @@ class Validation:
         warnings.warn(f"{cost}, and a simulated execution about as much.", CostWarning, stacklevel=2)
 
     def __repr__(self) -> str:
-        return lines(
-            call(self, self.space),
-            f"system: {shown(self.system)}",
-            f"model: {shown(self.model)}",
-            f"synthesizer: {shown(self.synthesizer)}",
-            f"distance: {shown(self.distance)}, task: {shown(self.task)}",
-        )
+        parts = {name: name_of(type(getattr(self, name))) for name in ("system", "model", "synthesizer", "distance")}
+        return call(self, self.space, **parts)
 
 
 @contextmanager

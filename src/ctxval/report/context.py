@@ -138,6 +138,11 @@ class ReportContext(ShortRepr):
         return self.space if isinstance(self.space, TaskSuite) else None
 
     @property
+    def axes(self) -> int:
+        """The number of parameters along which the distance is drawn: 0 in a suite, which has no tasks between its."""
+        return 0 if self.suite else self.space.dimension
+
+    @property
     def task_labels(self) -> tuple[str, ...]:
         """What heads the columns of :meth:`tasks_of`: the parameters with their units, or ``task``."""
         return tuple(self.space.labelled(self.space.low))
@@ -229,7 +234,7 @@ class ReportContext(ShortRepr):
     @functools.cached_property
     def distance_model(self) -> DistanceModel | None:
         """The distance over the tasks as the trials show it; None if it cannot be fitted."""
-        return DistanceModel.of(self.completed, self.space.members)
+        return DistanceModel.of(self.completed, self.space)
 
     @property
     def batched(self) -> bool:
