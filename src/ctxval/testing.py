@@ -79,8 +79,7 @@ def check_system(
     relative to the larger of 1 and the state; set it to the noise that you expect. Outputs are those of the
     :class:`ctxval.Validation`, if it has any.
     """
-    recorded = as_outputs(outputs)
-    expected_start = task.initial_state if recorded is None else recorded(task.initial_state)
+    expected_start = as_outputs(outputs)(task.initial_state)
     first, second = system.execute(controller, task), system.execute(controller, task)
     for trajectory in (first, second):
         _require(isinstance(trajectory, Trajectory), f"execute must return a Trajectory, got {type(trajectory)}")

@@ -79,7 +79,7 @@ def test_outputs_are_indices_or_a_function_of_one_state_or_of_many() -> None:
     assert one(x[:1, :1]).tolist() == many(x[:1, :1]).tolist() == [[[1.0]]]
     assert many(x).tolist() == one(x).tolist()
     assert one(x[0, 0]).tolist() == [1.0]
-    assert as_outputs(None) is None
+    assert not as_outputs(None).hide_states
     assert as_outputs(many) is many
 
 

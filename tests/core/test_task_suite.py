@@ -47,6 +47,10 @@ def test_a_search_may_choose_the_members_of_a_suite_and_any_point_of_a_box() -> 
     box = TaskSpace(**dict.fromkeys(SUITE.names, (0.0, 1.0)))
     np.testing.assert_array_equal(SUITE.candidates(points), SUITE.members)
     np.testing.assert_array_equal(box.candidates(points), points)
+    rng = np.random.default_rng(0)
+    assert box.examples(4, rng).shape == (7, SUITE.dimension)
+    assert {tuple(row) for row in SUITE.examples(100, rng)} == {tuple(row) for row in SUITE.from_unit(SUITE.members)}
+    assert SUITE.near(0.02) < box.near(0.02) == 0.02
 
 
 @given(suites, st.data())

@@ -22,6 +22,7 @@ def test_everything_agrees_with_dense_linear_algebra() -> None:
     np.testing.assert_allclose(factor.solve(right), inverse @ right, rtol=1e-9)
     np.testing.assert_allclose(factor.solve(right[:, 0]), inverse @ right[:, 0], rtol=1e-9)
     np.testing.assert_allclose(factor.whiten(right).T @ factor.whiten(right), right.T @ inverse @ right, rtol=1e-9)
+    np.testing.assert_allclose(factor.unwhiten(factor.whiten(right)), factor.solve(right), rtol=1e-9)
     for columns in (np.asfortranarray(right), np.ascontiguousarray(right)):
         np.testing.assert_allclose(factor.whiten_many(columns.copy("K")), factor.whiten(right), rtol=1e-9)
     np.testing.assert_allclose(factor.inverse(), inverse, rtol=1e-9, atol=1e-12)

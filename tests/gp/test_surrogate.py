@@ -10,7 +10,7 @@ from ctxval import searches
 from ctxval._util.arrays import Array
 from ctxval.errors import InputError
 from ctxval.gp import regression
-from ctxval.gp.cholesky import pivoted_cholesky, pivoted_rows
+from ctxval.gp.cholesky import pivoted_cholesky, pivoted_matrix, pivoted_rows
 from ctxval.gp.kernels import Matern
 from ctxval.gp.surrogate import SurrogateHyperparameters, fit_surrogate, kept_rows, learn
 from facts import refuses
@@ -295,3 +295,7 @@ def test_a_pivoted_factor_is_that_of_the_chosen_rows(seed: int, count: int, rank
     others = matrix[rows]
     left = matrix - others.T @ np.linalg.pinv(chosen, rcond=1e-12) @ others if count else matrix
     np.testing.assert_allclose(remaining, np.maximum(np.diag(left), 0.0), atol=1e-5 * np.trace(matrix))
+    of_whole = pivoted_matrix(np.diag(matrix), matrix, count, least=1e-9)
+    np.testing.assert_array_equal(of_whole[0], rows)
+    np.testing.assert_allclose(of_whole[1], L, atol=1e-6)
+    np.testing.assert_allclose(of_whole[2], remaining, atol=1e-6)

@@ -131,7 +131,8 @@ def test_bands_are_never_below_zero(swing: ReportContext) -> None:
 
 
 def test_the_distance_model_needs_two_distances() -> None:
-    assert DistanceModel.of(pendulum(executions=1).trials) is None
+    campaign = pendulum(executions=1)
+    assert DistanceModel.of(campaign.trials, campaign.validation.space) is None
 
 
 def test_inputs_at_the_limits_of_the_synthesizer_are_counted(flat: ReportContext) -> None:

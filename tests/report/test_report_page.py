@@ -19,6 +19,7 @@ from rig_pages import HOSTILE, hostile_store, pendulum, plane
 from ctxval import Campaign, Trial, report
 from ctxval.certificates import CertificateOptions, DistanceBound
 from ctxval.errors import InputError
+from ctxval.learning.stage_costs import Speed
 from ctxval.report import ReportContext, context_of_campaign, context_of_store
 from ctxval.report.sections.repeat import command_of, identity, python_snippet
 from ctxval.report.sections.trials import packed, recorded_lines
@@ -35,6 +36,15 @@ def swing() -> ReportContext:
 @pytest.fixture(scope="module")
 def html(swing: ReportContext) -> str:
     return report.page(swing)
+
+
+def test_pictures_think_within_their_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow = Speed(1.0, 0.1, 0.1, 0.05, 0.05, False, False, 2, 1, 25)
+    monkeypatch.setattr(Speed, "measured", classmethod(lambda *_: slow))
+    for thinking, corrected in ((0.5, False), (np.inf, True)):
+        context = context_of_campaign(pendulum(executions=4), thinking=thinking)
+        assert len(context.replays) == 4
+        assert {each.corrected is not None for each in context.replays.values()} == {corrected}
 
 
 def broken(page: str) -> bool:

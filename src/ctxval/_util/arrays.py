@@ -105,14 +105,15 @@ def rows_of(array: Array) -> Array:
 
 
 @functools.cache
-def _thread_pools() -> ThreadpoolController:
-    importlib.import_module("scipy.linalg")  # it has an algebra library of its own, which may not be loaded yet
+def _thread_pools(scipy: bool) -> ThreadpoolController:
+    if scipy:
+        importlib.import_module("scipy.linalg")  # it has an algebra library of its own, which may not be loaded yet
     return ThreadpoolController()
 
 
-def single_threaded() -> AbstractContextManager[Any]:
-    """Limit BLAS to one thread inside the context."""
-    return _thread_pools().limit(limits=1)  # type: ignore[no-any-return]
+def single_threaded(*, scipy: bool = True) -> AbstractContextManager[Any]:
+    """Limit BLAS to one thread inside the context; without ``scipy``, which takes time to load, that of numpy alone."""
+    return _thread_pools(scipy).limit(limits=1)  # type: ignore[no-any-return]
 
 
 def held_means(times: Array, values: Array, edges: Array, slack: float) -> Array:

@@ -1,4 +1,4 @@
-"""What objects show at a prompt: one to five short lines without raw arrays, however large or hostile their content.
+"""What objects show at a prompt: one short line without raw arrays, however large or hostile their content.
 
 A class that inherits :class:`ShortRepr` shows its fields; another one may say in its ``__repr__`` what matters.
 Nothing of it identifies an object in a store: that is :mod:`ctxval._util.describe`, and what is shown here is rounded.
@@ -28,10 +28,8 @@ from ctxval._util.texts import plain, quoted, shortened, visible
 class Widths:
     """How many characters of an object are shown."""
 
-    whole: int = 600
-    lines: int = 5  # number of lines
-    line: int = 150  # one line of several
-    call: int = 240  # an object in a single line
+    line: int = 150  # a text in a line
+    call: int = 300  # an object
     value: int = 90  # a value inside an object
     items: int = 6  # number of items of a collection
 
@@ -52,14 +50,6 @@ def line(text: object, longest: int = WIDTHS.line) -> str:
 
 def cut(text: str, longest: int) -> str:
     return text if len(text) <= longest else f"{text[: longest - 3]}..."
-
-
-def lines(head: str, *rows: str) -> str:
-    """Return a first line, and indented ones below it."""
-    shortened_rows = [cut(row, WIDTHS.line) for row in (head, *(f"  {row}" for row in rows[: WIDTHS.lines - 1]))]
-    text = "\n".join(shortened_rows)
-    short = WIDTHS.whole // WIDTHS.lines - 1
-    return text if len(text) <= WIDTHS.whole else "\n".join(cut(row, short) for row in shortened_rows)
 
 
 def call(owner: object, /, *items: object, **fields: object) -> str:
@@ -83,7 +73,7 @@ def fields_of(owner: Any) -> dict[str, Any]:
 
 
 class ShortRepr:
-    """A class whose objects show their fields: in one line if they fit into it, otherwise one below the other."""
+    """A class whose objects show their fields."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -91,12 +81,7 @@ class ShortRepr:
             cls.__repr__ = cls.__repr__  # type: ignore[method-assign]  # so that a dataclass does not make its own
 
     def __repr__(self) -> str:
-        fields = fields_of(self)
-        text = _called(type(self).__name__, [], fields)
-        if len(text) <= WIDTHS.call:
-            return text
-        rows = (f"{name}: {shown(value)}" for name, value in fields.items())
-        return lines(line(type(self).__name__, WIDTHS.value), *rows)
+        return call(self, **fields_of(self))
 
 
 def options(owner: object) -> dict[str, Any]:
@@ -132,7 +117,7 @@ def shown(value: Any, depth: int = 3) -> str:
             return cut(f"{ends[0]}{', '.join([*texts, *_rest(len(value))])}{single}{ends[1]}", 2 * WIDTHS.value)
     if inspect.isroutine(value):
         return name_of(value)
-    # What an object says of itself in one line, of ours the first; its class if that is nothing readable.
+    # What an object says of itself; its class if that is nothing readable.
     kind: Any = type(value)
     if kind.__repr__ is object.__repr__:
         return name_of(kind)
@@ -143,8 +128,7 @@ def shown(value: Any, depth: int = 3) -> str:
         return name_of(kind)
     if re.search(r" at 0x|\barray\(", text):  # an address in memory, or raw numbers, which tell a reader nothing
         return name_of(kind)
-    is_ours = str(kind.__module__).partition(".")[0] == __name__.partition(".")[0]
-    return cut(line(text.partition("\n")[0] if is_ours else text, 4 * WIDTHS.value), 2 * WIDTHS.value)
+    return cut(line(text, 4 * WIDTHS.value), 2 * WIDTHS.value)
 
 
 def number(value: Any) -> str:

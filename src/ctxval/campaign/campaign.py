@@ -584,16 +584,26 @@ class Campaign:
             CertificateError: if an option of the certificate is not valid.
         """
         options = CertificateOptions.or_automatic(certificate, confidence, resolution, share)
-        recorder = self.recorder
         self.state_threshold(threshold)
+        with progress_shown(progress):
+            return self.judged(threshold, options, thinking)[0]
+
+    def judged(
+        self, threshold: float, options: CertificateOptions, thinking: float | None
+    ) -> tuple[Verdict, Provenance]:
+        """Return the verdict, and what it follows from besides the trials; that the threshold was stated is not stored.
+
+        The arguments are those of :meth:`verdict`.
+        """
+        recorder = self.recorder
         recorder.dynamics.shortage = None
-        with progress_shown(progress), stage("certifying"), recorder.dynamics.thinking.limited(thinking):
+        with stage("certifying"), recorder.dynamics.thinking.limited(thinking):
             known, shortage = self.provenance_for(options, threshold), recorder.dynamics.shortage
             if shortage is None:
                 verdict = judge(recorder.trials, threshold, options, known)
             else:  # another bound has not seen what this evidence might show, such as noise
                 verdict = Verdict("undecided", threshold, f"{shortage}.", shortage=shortage.to_json())
-            return with_next_task(verdict, recorder, options)
+            return with_next_task(verdict, recorder, options), known
 
     @checked
     def certify(
@@ -688,5 +698,5 @@ class Campaign:
         return completed.points(self.validation.space.dimension), completed.distances
 
     def __repr__(self) -> str:
-        head = call(self, self.validation.space, name=self.name or None, seed=self.seed)
-        return display.as_text(head, self.recorder)
+        known = {"trials": len(self.trials), "worst": self.worst and self.worst.distance, "store": self.store}
+        return call(self, self.validation.space, name=self.name or None, seed=self.seed, **known)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import call, fields_of, lines, shown
+from ctxval._util.representation import call
 from ctxval._util.texts import text_of
 from ctxval.core.plan import Plan, ended_early, least_distance, recorded_before_failure, recorded_until_end
 from ctxval.core.trajectory import COMPLETE, Trajectory
@@ -53,8 +53,7 @@ class OpenTrial:
         return self.trial.number
 
     def __repr__(self) -> str:
-        parts = (f"{name}: {shown(part)}" for name, part in fields_of(self.plan).items())
-        return lines(call(self, self.number, origin=self.trial.origin), *parts)
+        return call(self, self.number, origin=self.trial.origin, plan=self.plan)
 
 
 @dataclass(frozen=True, eq=False)

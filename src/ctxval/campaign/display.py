@@ -1,43 +1,19 @@
-"""Views of a campaign: as text, and as a table of pandas."""
+"""The trials of a campaign as a table of pandas."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ctxval._util.representation import Shown, counted, lines, named, number, shown
-from ctxval.campaign.trials import TrialRecorder
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TASK, TaskSuite
-from ctxval.core.trial import Trial, Trials
+from ctxval.core.trial import Trial
 from ctxval.errors import InputError
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 _BEFORE, _AFTER = ("number", "origin", "state"), ("distance", "seconds", "attempts", "failure")
-
-
-def as_text(head: str, recorder: TrialRecorder) -> str:
-    """Return a campaign in five lines: the task space, the search, the number of trials, the worst task, the store."""
-    worst, at = recorder.trials.worst, "no distance is known"
-    if worst is not None and worst.distance is not None:
-        where = named(worst.parameters, recorder.validation.space.units)
-        at = f"trial {worst.number} with distance {number(worst.distance)} at {where}"
-    return lines(
-        head,
-        f"search: {shown(recorder.search)}",
-        f"trials: {_counts(recorder.trials)}",
-        f"worst: {at}",
-        f"store: {shown(recorder.store)}",
-    )
-
-
-def _counts(trials: Trials) -> Shown:
-    states = Counter(trial.state for trial in trials)
-    counts = [counted(trials.executions, "execution"), *(f"{count} {state}" for state, count in states.items())]
-    return Shown(f"{len(trials)} ({', '.join(counts)})")
 
 
 def to_dataframe(trials: Sequence[Trial], space: TaskSpace) -> DataFrame:

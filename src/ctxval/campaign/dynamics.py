@@ -127,6 +127,12 @@ class CampaignDynamics:
         """Return whether the budget of the choice after trials allows no closed loops; nothing is learned."""
         return self.thinking.ledger(trials, len(executed_trials(self._store, trials))).spent_up
 
+    def affords(self, trials: Sequence[Trial], loops: int) -> bool:
+        """Return whether loops on what trials teach fit into a budget of their own, beside that of learning it."""
+        ledger = self.ledger(trials)
+        seconds = ledger.seconds("loops", lambda costs: costs.plan(loops) + costs.run(1, loops))
+        return ledger.costs is None or seconds <= ledger.costs.thinking.seconds
+
     def note(self, trials: Sequence[Trial]) -> dict[str, Any]:
         """Return what the next trial stores of the thinking on its task; empty without a budget."""
         note = self.thinking.note(trials, self.ledger(trials) if trials else Ledger())
@@ -376,7 +382,7 @@ class CampaignDynamics:
             scatter=learned.scatter if learned.predicts_distributions else 0.0,
             physical=learned.study.given.physical,
             without_data=not learned.with_data,
-            estimated=learned.study.given.outputs is not None,
+            estimated=learned.study.given.outputs.hide_states,
             negligible=learned.negligible,
             best=Trials(trials).largest,
             worst=() if (largest := Trials(trials).worst) is None else tuple(largest.unit_point.tolist()),

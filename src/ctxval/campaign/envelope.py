@@ -197,8 +197,8 @@ class EnvelopeSearch:
         parameter = evidence.unsampled_parameter
         if parameter is not None and parameter.gap > evidence.limits.gap:
             return Choice.tested(parameter.task)
-        pool, is_suite = learned.study.search.pool, recorder.validation.space.members is not None
-        drawn = self._at(learned, pool if is_suite else pool[: CANDIDATES.screened], settled=False)
+        space, pool = recorder.validation.space, learned.study.search.pool
+        drawn = self._at(learned, space.candidates(pool[: CANDIDATES.screened]), settled=False)
         below, leaving = drawn.mean <= self._threshold, drawn.uncovered(evidence.most_beyond)
         # Within three spreads above the mean, a task is uncertain.
         straddle = 3.0 * drawn.spread(self._threshold) - np.abs(drawn.mean - self._threshold)  # Bryan et al. 2006
@@ -210,9 +210,9 @@ class EnvelopeSearch:
         # Share of the tasks predicted below the threshold that may be uncertain or uncovered at the end.
         if few or (uncertain | uncovered).sum() > 0.03 * below.sum():
             score = straddle if uncertain.sum() >= uncovered.sum() else np.where(uncovered, leaving, -np.inf)
-            executed = recorder.trials.points(recorder.validation.space.dimension)
+            executed = recorder.trials.points(space.dimension)
             away = np.abs(drawn.points[:, None] - executed).max(axis=2)
-            new = (away > (0.0 if is_suite else NEAR)).all(axis=1)
+            new = (away > space.near(NEAR)).all(axis=1)
             if (np.isfinite(score) & new).any():
                 return Choice.tested(drawn.points[int(np.where(new, score, -np.inf).argmax())])
         outlive = regular is None and must_outlive_a_test(drawn, evidence, self._threshold)

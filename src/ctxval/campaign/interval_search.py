@@ -33,9 +33,8 @@ from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import DistanceBound
 from ctxval.certificates.prediction_tests import DRAWN, HYPERCUBE, MANY, TESTS, hypercube_in
 from ctxval.certificates.predictions import missing_tests, mostly_fail
-from ctxval.certificates.sample import SAME
 from ctxval.certificates.task_share import PREDICTED_ABOVE, bet_on
-from ctxval.certificates.verdict import counterexample, require_suite
+from ctxval.certificates.verdict import counterexample, require_possible
 from ctxval.core.target import Target
 from ctxval.core.trial import Trial, Trials
 from ctxval.errors import CertificateError, InputError
@@ -70,8 +69,7 @@ class IntervalSearch:
 
     def __post_init__(self) -> None:
         require_decisive(self.options)
-        if self._suite is not None:
-            require_suite(self.options.kind)
+        require_possible(self.options.kind, self.recorder.validation.space)
         if self.threshold is None and isinstance(self.options.kind, AnytimeAudit):
             raise InputError("an anytime audit ends by its threshold; state one, or run another certificate.")
         self.options.kind.require_usable(self.options.confidence, self.budget)
@@ -150,7 +148,7 @@ class IntervalSearch:
     def _repeats_suffice(self) -> bool:
         """Return whether the tasks of a suite were executed so often that a quantile of each keeps the limit."""
         space, trials = self.recorder.validation.space, self.recorder.trials.ended
-        if space.members is None or space.repeats == 1 or not trials:
+        if space.repeats == 1 or not trials:
             return False
         sample = replace(Sample.of(trials), suite=space.members, repeats=space.repeats)
         with suppress(CertificateError):
@@ -163,10 +161,10 @@ class IntervalSearch:
         trials = self.recorder.trials
         # A hypercube that was begun is completed, because what a part of it shows must not decide that it is left.
         number, row = divmod(spread_tests(trials), TESTS)
-        if (self.tests >= MANY or self._target.by_draws) and self._suite is None and not row:
-            return Choice.tested(self.recorder.draw(), "iid")
         if self._suite is not None:
             return Choice.tested(self.recorder.draws.hypercube(number)[row], "spread")
+        if (self.tests >= MANY or self._target.by_draws) and not row:
+            return Choice.tested(self.recorder.draw(), "iid")
         if row:
             begun = (hypercube_in(trial.note) for trial in reversed(trials))
             (chosen, _), note = next(filter(None, begun), (0, 1.0)), None
@@ -376,10 +374,9 @@ class IntervalSearch:
     @property
     def _near(self) -> float:
         """The largest change of each coordinate to a task that is no new one."""
-        if self._suite is not None:
-            return SAME
         # A distance with kinks may be large in a few tasks only, which are next to others where it is 0.
-        return 0.1 * NEAR if is_kinked(self.recorder.validation.distance) else NEAR
+        kinked = is_kinked(self.recorder.validation.distance)
+        return self.recorder.validation.space.near(0.1 * NEAR if kinked else NEAR)
 
 
 def is_decisive(options: CertificateOptions) -> bool:

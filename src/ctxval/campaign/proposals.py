@@ -272,7 +272,7 @@ def _number_of_model(validation: Validation) -> int:
         return 0
     visited, n = np.concatenate(rows), loop.states.shape[-1]
     low, high = visited.min(axis=0), visited.max(axis=0)
-    if validation.outputs is None:
+    if not validation.outputs.hide_states:
         with suppress(Exception):  # a model may refuse states that its closed loops do not visit
             z = np.random.default_rng(0).uniform(2 * low - high, 2 * high - low, (2000, len(low)))
             rows.append(validation.model.step(z[:, :n], z[:, n:]))

@@ -151,7 +151,7 @@ class Watch:
     def _require_states(self, trajectory: Trajectory) -> None:
         """Refuse a recording without a task that cannot be compared with predictions."""
         learned, validation = self._statistics.learned, self._recorder.validation
-        if learned.study.given.physical or validation.outputs is not None:
+        if learned.study.given.physical or validation.outputs.hide_states:
             raise InputError(
                 f"a recording needs the parameters of its task, {', '.join(validation.space.names)}: the "
                 "learned dynamics depend on a task parameter, or only outputs are recorded. On the command line, give "

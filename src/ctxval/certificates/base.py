@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from ctxval._util.arrays import Array
 from ctxval._util.registry import Registry
-from ctxval._util.representation import ShortRepr, Shown, call, line, lines
+from ctxval._util.representation import ShortRepr, Shown, call
 from ctxval._util.texts import as_text
 from ctxval._util.version import VERSION
 from ctxval.certificates.bounds import ERRORS, at_most, with_error
@@ -85,9 +85,8 @@ class Certificate:
 
     def __repr__(self) -> str:
         bound, volume = Shown(with_error(self.upper_bound, self.error)), Shown(at_most(self.volume, 3))
-        head = call(self, self.kind, upper_bound=bound, confidence=self.confidence, volume=volume, trials=self.trials)
-        withdrawn = [] if self.doubt is None else [f"withdrawn: {line(self.doubt)}"]
-        return lines(head, *withdrawn, line(self.statement), f"assumptions: {len(self.assumptions)}")
+        known = {"upper_bound": bound, "confidence": self.confidence, "volume": volume, "trials": self.trials}
+        return call(self, self.kind, **known, withdrawn=self.doubt)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -137,21 +137,27 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
         )
     if doubt is None and opened:
         doubt, withdrawn_by = str(opened[0]), opened[0].code
-    empty = None if sample.suite is not None else largest_empty_box(sample.points)
+    of_tasks: dict[str, Any] = {"empty_box": None, "tasks": sample.tasks, "not_executed": sample.not_executed}
+    if sample.suite is None:
+        empty = largest_empty_box(sample.points)
+        of_tasks = {"empty_box": empty and asdict(empty)}
     statement = statements.dynamics_statement(upper, error, confidence, evidence)
     level = upper if sample.threshold is None else sample.threshold
     above = sum(each.distance > level for each in evidence.executed)
+    alone, of_share = dict[str, Any](), dict[str, Any]()
+    if target.share < 1:
+        alone, of_share = _tests_alone(sample, level, confidence), {"of_mean": evidence.highest}
     copied = {name: getattr(evidence, name) for name in _COPIED}
     details = {
         "best": sample.best,
-        **({} if sample.suite is None else {"tasks": sample.tasks, "not_executed": sample.not_executed}),
+        **of_tasks,
         "gap": upper - sample.best,
         "raised_from": None if worst is None else evidence.bound,
         "raised_by_trial": None if worst is None else worst.trial,
         "error": error,
         "executions": evidence.executions,
         **target.to_json(),
-        **({"of_mean": evidence.highest} if target.share < 1 else {}),
+        **of_share,
         "draws": len(evidence.maxima),
         **({"thinking": {"replaced": list(evidence.replaced)}} if evidence.replaced else {}),
         "largest_draw": float(finite.max()) if len(finite) == len(evidence.maxima) else None,
@@ -168,7 +174,7 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
                 drawn, sample.points.shape[1], confidence, uniform=sample.is_uniform, selected=sample.selected
             ),
             "largest_error": max((test.error for test in tests), default=None),
-            **(_tests_alone(sample, level, confidence) if target.share < 1 else {}),
+            **alone,
         },
         "checked": [{**each.to_json(), "held": bool(evidence.holds(each))} for each in evidence.predictions],
         "open_checks": [each.to_json() for each in opened],
@@ -182,7 +188,6 @@ def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
         "variance_left_out": evidence.left_out,
         "unvisited_region": evidence.unvisited_region and asdict(evidence.unvisited_region),
         "untested_rest": evidence.untested_rest and asdict(evidence.untested_rest),
-        "empty_box": None if empty is None else asdict(empty),
         "pushed": evidence.pushed and evidence.pushed.to_json(),
         "differing": None if differing is None else [sample.numbers[row] for row in differing],
     }

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from ctxval._util.checked import PositiveFloat, checked, require
-from ctxval._util.representation import ShortRepr, call, line, lines, shown
+from ctxval._util.representation import ShortRepr, Shown, call, line
 from ctxval.certificates.base import KINDS, Certificate, CertificateKind
 from ctxval.certificates.bets import Bets, bets_against
 from ctxval.certificates.bounds import NO_UNITS, Quantities
@@ -17,6 +17,7 @@ from ctxval.certificates.provenance import Provenance
 from ctxval.certificates.sample import Sample, without_success
 from ctxval.certificates.sentences import verdicts as sentences
 from ctxval.certificates.task_share import ShareBets, bets_on_share
+from ctxval.core.space import TaskSpace
 from ctxval.core.target import LARGEST_DISTANCE, Target
 from ctxval.core.trial import Trial, designs_sentence
 from ctxval.errors import CertificateError
@@ -52,13 +53,8 @@ class Verdict:
         return f"{self.answer}: {self.reason}" + (f" {self.rests_on}" if self.rests_on else "")
 
     def __repr__(self) -> str:
-        head = call(self, self.answer, threshold=self.threshold)
-        if self.rests_on:
-            # The text of a verdict has both sentences whole.
-            return "\n  ".join([head, f"reason: {line(self.reason, 180)}", line(self.rests_on, 330)])
-        parts = {"witness": self.witness, "certificate": self.certificate, "expected": self.expected}
-        known = (f"{name}: {shown(part)}" for name, part in parts.items() if part is not None)
-        return lines(head, f"reason: {line(self.reason)}", *known)
+        text = call(self, self.answer, threshold=self.threshold, reason=Shown(line(self.reason)))
+        return f"{text}\n  {line(self.rests_on, 330)}" if self.rests_on else text
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer and its reasons, ready for JSON; the certificate has its own."""
@@ -189,16 +185,17 @@ def _certified(
     suite, repeats = (None, 1) if known.space is None else (known.space.members, known.space.repeats)
     sample, kind = Sample.of(trials, known.learned), options.kind
     sample = replace(sample, distribution=known.distribution, suite=suite, repeats=repeats, threshold=threshold)
-    if suite is not None:
-        require_suite(kind)
+    require_possible(kind, known.space)
     # No statement may count draws whose number depended on their distances.
     sample = sample if kind.sorts_draws else sample.with_countable_draws()
     certificate = kind.certify(sample, options.confidence)
     return replace(certificate, assumptions=(*certificate.assumptions, *known.remarks))
 
 
-def require_suite(kind: CertificateKind) -> None:
-    """Refuse a kind of certificate that is not for suites of tasks."""
+def require_possible(kind: CertificateKind, space: TaskSpace | None) -> None:
+    """Refuse a kind of certificate, or its target, that is not for suites of tasks if the space is one."""
+    if space is None or space.members is None:
+        return
     if not kind.takes_suites:
         kinds = ", ".join(name for name in KINDS.built_in if KINDS.find(name).takes_suites)
         raise CertificateError(

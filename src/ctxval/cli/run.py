@@ -113,9 +113,10 @@ def run(
                 if not current:
                     from ctxval import report as reports  # imported here, because a finished campaign has one
 
-                    reports.write_page(
-                        reports.context_of_campaign(campaign, verdict, budget=total, envelope=trusted), page
+                    context = reports.context_of_campaign(
+                        campaign, verdict, budget=total, envelope=trusted, thinking=settings.thinking
                     )
+                    reports.write_page(context, page)
                 report["report"] = str(page)
             except Exception as error:  # it must not hide the verdict, for which executions were paid
                 err.say(f"no report: {reason_of(error)}")

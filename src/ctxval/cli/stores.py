@@ -146,7 +146,9 @@ def write_report(
     else:
         limit, budget = Limits(asked.threshold).completed_by(loaded.settings, loaded.experiment)
         options = asked.options(loaded.settings, asked.kind)
-        context = reports.context_of_campaign(loaded.campaign, threshold=limit, certificate=options, budget=budget)
+        context = reports.context_of_campaign(
+            loaded.campaign, threshold=limit, certificate=options, budget=budget, thinking=loaded.settings.thinking
+        )
     written = {"report": str(reports.write_page(context, target))}
     if junit is not None:
         written["junit"] = str(write_text(junit, reports.junit(context)))

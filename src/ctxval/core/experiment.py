@@ -12,7 +12,7 @@ import numpy as np
 
 from ctxval._util.checked import PositiveFloat, PositiveInt, checked
 from ctxval._util.columns import differ
-from ctxval._util.representation import call, lines
+from ctxval._util.representation import call
 from ctxval._util.texts import parted
 from ctxval.core.labels import Labels, names_of, require_same_units, units_of
 from ctxval.core.truth import Truth
@@ -109,6 +109,5 @@ class Experiment:
         return self.validation.names(states, inputs)
 
     def __repr__(self) -> str:
-        known = {"threshold": self.threshold, "units": self.units or None, "truth": self.truth}
-        head = call(self, self.name, self.validation.space, budget=self.budget, **known)
-        return lines(head, *(part.strip() for part in repr(self.validation).splitlines()[1:]))
+        known = {"budget": self.budget, "threshold": self.threshold, "units": self.units or None}
+        return call(self, self.name, self.validation, **known)

@@ -12,6 +12,7 @@ from ctxval._util.arrays import Array, ArrayLike, as_finite, as_floats, read_onl
 from ctxval._util.checked import Must, NonNegativeInt, checked
 from ctxval._util.representation import call, named
 from ctxval._util.texts import parted, shortened
+from ctxval.core.task import Task
 from ctxval.core.task_distribution import ByParameter, BySampler, Continuous, Sampler, TaskDistribution
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 
@@ -237,9 +238,20 @@ class TaskSpace:
         """Return the members that may follow executions at points ``(n, d)``; None if tasks fill the box."""
         return None
 
-    def task_names_at(self, points: Array) -> Any:
-        """Return the names of the tasks at points ``(..., d)`` of the space, ``(...)``; empty if they have none."""
-        return ""
+    def near(self, change: float) -> float:
+        """Return the largest change of each coordinate to a task that is no new one; of a suite, all others are new."""
+        return change
+
+    def examples(self, count: int, rng: np.random.Generator) -> Array:
+        """Return the lowest, the middle and the highest task, and so many random ones, points ``(m, d)`` of the space.
+
+        Of a suite, they are as many of its tasks.
+        """
+        return np.concatenate([[self.low, 0.5 * (self.low + self.high), self.high], self.iid(count, rng)])
+
+    def named(self, task: Task, points: Array) -> Task:
+        """Return the task at a point of the space ``(d,)``, or a batch of points, with its name if it has one."""
+        return task
 
     def unit_function(self, function: Callable[[Parameters], ArrayLike]) -> Callable[[Array], Array]:
         """Return a function of named parameters as one of unit-cube points ``(n, d)``, which searches know."""

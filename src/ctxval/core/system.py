@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller, seeing
 from ctxval.core.model import Model, Step, as_model, central_differences
 from ctxval.core.rollout import rollout
+from ctxval.core.state_geometry import PLAIN, StateGeometry, geometry_of
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError, ShapeError
@@ -29,6 +30,12 @@ class Outputs(ShortRepr):
 
     A function that takes one state ``(n,)`` at a time is called once for each.
     """
+
+    hide_states: ClassVar[bool] = True
+    """Whether states of M are not recorded, so that they must be estimated."""
+
+    name: ClassVar[str] = "the outputs"
+    """What goals and references are compared with, in error messages."""
 
     def __init__(self, given: OutputsLike) -> None:
         if callable(given):
@@ -96,10 +103,51 @@ class Outputs(ShortRepr):
         """
         return seeing(controller, self, lambda given: given if task is None else task)
 
+    def recording(self, system: System) -> System:
+        """Return a system that records these outputs, in the place of one that records states."""
+        return WithOutputs(system, self)
 
-def as_outputs(given: OutputsLike | Outputs | None) -> Outputs | None:
-    """Return outputs from any form in which users may give them; None stays None."""
-    return given if given is None or isinstance(given, Outputs) else Outputs(given)
+    def geometry(self, model: Model) -> StateGeometry:
+        """Return the geometry of what is recorded of a model's states."""
+        return PLAIN
+
+
+class AllStates(Outputs):
+    """The states themselves, if all of them are recorded."""
+
+    hide_states = False
+    name = "its initial_state"
+
+    def __init__(self) -> None:
+        super().__init__(np.asarray)
+
+    def __call__(self, x: Array) -> Array:
+        """Return states as they are."""
+        return x
+
+    def of(self, trajectory: Trajectory) -> Trajectory:
+        """Return a trajectory as it is."""
+        return trajectory
+
+    def seen_by(self, controller: Controller, task: Task | None = None) -> Controller:
+        """Return a controller as it is."""
+        return controller
+
+    def recording(self, system: System) -> System:
+        """Return a system as it is."""
+        return system
+
+    def geometry(self, model: Model) -> StateGeometry:
+        """Return the geometry of a model's states."""
+        return geometry_of(model)
+
+
+ALL_STATES = AllStates()
+
+
+def as_outputs(given: OutputsLike | Outputs | None) -> Outputs:
+    """Return outputs from any form in which users may give them; None means all states."""
+    return ALL_STATES if given is None else given if isinstance(given, Outputs) else Outputs(given)
 
 
 @runtime_checkable

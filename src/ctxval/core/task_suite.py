@@ -17,6 +17,7 @@ from ctxval._util.checked import PositiveInt, require
 from ctxval._util.representation import call
 from ctxval._util.texts import enumerated, shortened
 from ctxval.core.space import Parameters, Point, TaskSpace
+from ctxval.core.task import Task
 from ctxval.core.task_distribution import Continuous, Sampler
 from ctxval.errors import InputError, UnknownNameError
 
@@ -136,6 +137,15 @@ class TaskSuite(TaskSpace):
         executions = self.executions(known)
         return np.asarray(self.members[executions == min(executions.min(), self.repeats - 1)])
 
+    def near(self, change: float) -> float:
+        return 1e-9
+
+    def examples(self, count: int, rng: np.random.Generator) -> Array:
+        return rng.permutation(self._rows)[: count + 3]
+
+    def named(self, task: Task, points: Array) -> Task:
+        return task.named(self.task_names_at(points))
+
     # Between points, the unit cube and names
 
     def from_unit(self, unit: ArrayLike) -> Array:
@@ -158,6 +168,7 @@ class TaskSuite(TaskSpace):
         return Parameters(self, self.from_unit(self.to_unit(points)))
 
     def task_names_at(self, points: Array) -> Any:
+        """Return the names of the tasks at points ``(..., d)`` of the space, ``(...)``."""
         names = np.asarray(self.task_names)[self.rows_at(self.to_unit(points))]
         return names if names.ndim else str(names)
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ctxval._util.arrays import Array, read_only
-from ctxval._util.representation import ShortRepr, call, counted, line, lines
+from ctxval._util.representation import ShortRepr, call, counted
 from ctxval.core.space import Point
 
 Origin = Literal["iid", "spread", "initial", "acquisition", "covering", "manual"]
@@ -90,9 +90,8 @@ class Trial:
 
     def __repr__(self) -> str:
         ended = {"distance": self.distance, "seconds": self.seconds, "attempts": self.attempts}
-        head = call(self, self.number, origin=self.origin, state=self.state, **ended, parameters=self.parameters)
-        texts = {"failure": self.failure, "because": self.because}
-        return lines(head, *(f"{name}: {line(text)}" for name, text in texts.items() if text is not None))
+        about = {"parameters": self.parameters, "failure": self.failure, "because": self.because}
+        return call(self, self.number, origin=self.origin, state=self.state, **ended, **about)
 
 
 class Trials(tuple[Trial, ...]):

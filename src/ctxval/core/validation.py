@@ -18,7 +18,7 @@ from ctxval._util.checked import NonNegativeFloat, PositiveInt, checked
 from ctxval._util.cores import raised_by_signal
 from ctxval._util.describe import describe, without_numbers
 from ctxval._util.progress import advance
-from ctxval._util.representation import call, lines, shown
+from ctxval._util.representation import call, name_of
 from ctxval._util.texts import parted, reason_of
 from ctxval.core.controller import Controller, Synthesizer, is_controller
 from ctxval.core.distance import Distance
@@ -28,7 +28,6 @@ from ctxval.core.model import Model, Step, as_model, require_time_step
 from ctxval.core.plan import Outcome, Plan, ended_early, recorded_until_end, require_complete, require_execution
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
-from ctxval.core.state_geometry import geometry_of
 from ctxval.core.system import OutputsLike, Simulated, System, WithOutputs, as_outputs
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
@@ -96,21 +95,21 @@ class Validation:
         named = getattr(distance, "with_states", None)
         if callable(named):
             distance = named(tuple(parted(label)[0] for label in states))
+        self.outputs = as_outputs(outputs)
         turning = getattr(distance, "with_quaternions", None)
-        if callable(turning) and outputs is None:
-            distance = turning(geometry_of(self.model).quaternions)
+        if callable(turning):
+            distance = turning(self.outputs.geometry(self.model).quaternions)
         self.distance: Distance = until_fall(distance, synthesizer)
         self.start_tolerance = float(start_tolerance)
         self.longest = int(longest)
         self.physical = tuple(dict.fromkeys(physical))
         for name in self.physical:
             space.columns(name)
-        self.outputs = as_outputs(outputs)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this validation in a store."""
         parts = {part: describe(getattr(self, part)) for part in ("space", "task", "system", "synthesizer", "distance")}
-        if self.outputs is not None:
+        if self.outputs.hide_states:
             parts["outputs"] = describe(self.outputs)
         # The numbers of M are learned: its closed loops show whether it is the same.
         return {**parts, "model": without_numbers(describe(self.model))}
@@ -121,9 +120,7 @@ class Validation:
         The distance, with its units, is how far M is from completing its task, as :class:`ctxval.distances.GoalError`.
         """
         labels = self.labels if units is None else replace(self.labels, units=units)
-        system: System = Simulated(self.model)
-        if self.outputs is not None:
-            system = WithOutputs(system, self.outputs)
+        system = self.outputs.recording(Simulated(self.model))
         return self.with_parts(system=system, distance=distance, labels=labels, start_tolerance=START)
 
     @property
@@ -134,27 +131,25 @@ class Validation:
 
     def recorded(self, x: Array) -> Array:
         """Return what is recorded in states of M ``(..., n)``: their outputs if there are any, or these states."""
-        return x if self.outputs is None else self.outputs(x)
+        return self.outputs(x)
 
     def require_states(self, what: str) -> None:
         """Refuse outputs in the place of states for what needs recorded states of M."""
-        if self.outputs is not None:
+        if self.outputs.hide_states:
             raise InputError(f"{what} needs recorded states of M, and this validation records outputs h(x) of them.")
 
     def require_goal(self, task: Task) -> None:
         """Refuse a task whose goal or reference has other components than what is recorded."""
         with _failing_as(InputError, "the outputs h(x)"):
             width = self.recorded(task.initial_state).shape[-1]
-        task.require_width(width, "its initial_state" if self.outputs is None else "the outputs")
+        task.require_width(width, self.outputs.name)
 
     def recorded_task(self, task: Task) -> Task:
         """Return a task as who executes it knows it: with the outputs of its initial state, if there are any."""
-        return task if self.outputs is None else task.starting_at(self.recorded(task.initial_state))
+        return task.starting_at(self.recorded(task.initial_state))
 
     def closed_loop(self, controller: Controller, task: Task) -> Trajectory:
         """Return the closed loop of a controller with M, as it is recorded."""
-        if self.outputs is None:
-            return rollout(self.model, controller, task)
         return self.outputs.of(rollout(self.model, self.outputs.seen_by(controller), task))
 
     def with_parts(self, **changed: Any) -> Validation:
@@ -208,8 +203,8 @@ class Validation:
         tolerance = self.start_tolerance if start_tolerance is None else start_tolerance
         if not isinstance(trajectory, Trajectory):
             raise ExecutionError(f"the system returned {type(trajectory).__name__} instead of a Trajectory")
-        if (wanted := plan.task.initial_state).shape == trajectory.states.shape[-1:] and self.outputs is None:
-            geometry = geometry_of(self.model)
+        if (wanted := plan.task.initial_state).shape == trajectory.states.shape[-1:]:
+            geometry = self.outputs.geometry(self.model)
             if geometry.quaternions and trajectory.states.ndim == 2:
                 trajectory = replace(trajectory, states=geometry.continued(trajectory.states, wanted))
         if ended_early(plan, trajectory) and (plan.model_trajectory.ended != COMPLETE or self.falls(trajectory)):
@@ -372,7 +367,7 @@ class Validation:
         require_time_step(self.model, task.dt, "the task")
         if task.horizon > self.longest or (task.horizon > self.cost_stated_from and self not in _stated):
             self._state_cost(parameters, task)
-        return task if self.space.members is None else task.named(self.space.task_names_at(parameters.points))
+        return self.space.named(task, parameters.points)
 
     def _state_cost(self, parameters: Parameters, task: Task) -> None:
         """State the cost of a long horizon once, from the first steps of a plan; refuse one that is too long."""
@@ -394,13 +389,8 @@ class Validation:
         warnings.warn(f"{cost}, and a simulated execution about as much.", CostWarning, stacklevel=2)
 
     def __repr__(self) -> str:
-        return lines(
-            call(self, self.space),
-            f"system: {shown(self.system)}",
-            f"model: {shown(self.model)}",
-            f"synthesizer: {shown(self.synthesizer)}",
-            f"distance: {shown(self.distance)}, task: {shown(self.task)}",
-        )
+        parts = {name: name_of(type(getattr(self, name))) for name in ("system", "model", "synthesizer", "distance")}
+        return call(self, self.space, **parts)
 
 
 @contextmanager

@@ -31,6 +31,10 @@ class CholeskyFactor:
         """Return ``L^-1 right``; if a column of ``right`` has covariance K, that of the result is the identity."""
         return np.asarray(scipy.linalg.lapack.dtrtrs(self.L, right, lower=1)[0])
 
+    def unwhiten(self, right: Array) -> Array:
+        """Return ``L'^-1 right``; of what was whitened before, it is ``K^-1`` times it."""
+        return np.asarray(scipy.linalg.lapack.dtrtrs(self.L, right, lower=1, trans=1)[0])
+
     def whiten_many(self, right: Array) -> Array:
         """Return ``L^-1 right`` by the inverse factor, faster for many contiguous columns; they may be overwritten."""
         return np.asarray(scipy.linalg.blas.dtrmm(1.0, self.inverse_factor, right, lower=1, overwrite_b=1))
@@ -101,3 +105,15 @@ def pivoted_cholesky(
         chosen.append(pivot)
     rows = np.array(chosen, dtype=np.intp)
     return rows, np.tril(columns[: len(rows)][:, rows].T), np.maximum(left, 0.0)
+
+
+def pivoted_matrix(variances: Array, covariance: Array, count: int, least: float) -> tuple[Rows, Array, Array]:
+    """Return what :func:`pivoted_cholesky` returns, for a matrix ``(n, n)`` that is known as a whole."""
+    left = np.array(variances)
+    if not left.max(initial=0.0) > least:  # LAPACK takes the first row in any case
+        return np.empty(0, dtype=np.intp), np.empty((0, 0)), np.maximum(left, 0.0)
+    lower, pivots, rank, _ = scipy.linalg.lapack.dpstrf(covariance, lower=1, tol=least)
+    k, order = min(int(rank), count), pivots.astype(np.intp) - 1
+    left[order[:k]] = 0.0
+    left[order[k:]] -= (lower[k:, :k] ** 2).sum(axis=1)
+    return order[:k], np.tril(lower[:k, :k]), np.maximum(left, 0.0)

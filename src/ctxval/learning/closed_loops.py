@@ -139,6 +139,19 @@ class LoopPlanner:
         advance(len(draws) * sum(len(plan.rows) for plan in planned), units=_UNITS)
         return distances
 
+    def distance_of(self, point: Array, trajectory: Trajectory) -> float:
+        """Return the distance of an execution of a task ``(d,)``; 0 if it is not known."""
+        for plan in self.plan(point[None]):
+            model = plan.nominal
+            if model.states.size == trajectory.states.size:
+                shapes = model.states.shape, model.inputs.shape
+                states, inputs = (
+                    x.reshape(s) for x, s in zip((trajectory.states, trajectory.inputs), shapes, strict=True)
+                )
+                distance = self.compared(plan, Trajectory(model.times, states, inputs))
+                return float(np.nan_to_num(distance, posinf=0.0)[0])
+        return 0.0
+
     def own_distances(self, draws: Draws, points: Array) -> Array:
         """Return the distances ``(S, q)`` of each draw on tasks of its own, at points ``(S, q, d)``."""
         (S, q, d), R = points.shape, draws.replicates
@@ -210,8 +223,9 @@ class LoopPlanner:
     def compared(self, planned: PlannedTasks, loops: Trajectory) -> Array:
         """Return the distances ``(q,)`` of loops; infinity if one ends alone or is not measured, NaN if M diverges."""
         task, nominal, between = planned.task, planned.nominal, self.validation.distance_between
-        model, system, known = nominal, loops, nominal.finite & loops.finite
-        if (both := nominal.predicts & ~nominal.finite & loops.predicts & ~loops.finite).any():  # they ended early
+        finite, predicts = (nominal.finite, loops.finite), nominal.predicts
+        model, system, known = nominal, loops, finite[0] & finite[1]
+        if (both := predicts & ~finite[0] & loops.predicts & ~finite[1]).any():  # they ended early
             common, known = np.minimum(nominal.lengths, loops.lengths), known | both
             model, system = (run.held(common, task.times) for run in (nominal, loops))
         if not known.all():  # a distance need not take what is not finite
@@ -230,7 +244,7 @@ class LoopPlanner:
                     alone = between(model[k], system[k], task[k])
                     values[k] = alone if not alone.shape else np.inf
         distances = np.where(known & np.isfinite(values), values, np.inf)
-        return np.where(nominal.predicts, distances, np.nan).reshape(len(planned.rows))
+        return np.where(predicts, distances, np.nan).reshape(len(planned.rows))
 
 
 def _probed(controller: Controller, task: Task, steps: int) -> Array:

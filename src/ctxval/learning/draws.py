@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -108,11 +109,21 @@ class DynamicsDraws(DrawsWithoutNoise):
     limit: Array | None = None
 
     def __len__(self) -> int:
-        return sum(len(expansion.weights) for expansion in self.expansions)
+        return self._firsts[-1]
+
+    @functools.cached_property
+    def _firsts(self) -> list[int]:
+        """The first draw of each group, and the number of all."""
+        return [0, *accumulate(len(expansion.weights) for expansion in self.expansions)]
+
+    @functools.cached_property
+    def _moved(self) -> tuple[Rows, Array]:
+        """The learned states, and the units of their residuals."""
+        at = np.flatnonzero(self.data.learned)
+        return at, self.data.units[at]
 
     def _some(self, rows: Rows) -> Self:
-        firsts = np.cumsum([0, *(len(each.weights) for each in self.expansions)])
-        chosen = [rows[(rows >= first) & (rows < last)] - first for first, last in pairwise(firsts)]
+        chosen = [rows[(rows >= first) & (rows < last)] - first for first, last in pairwise(self._firsts)]
         kept = tuple(each[some] for each, some in zip(self.expansions, chosen, strict=True) if len(some))
         model = self.model[rows] if isinstance(self.model, DryFriction) else self.model
         return replace(self, expansions=kept, model=model)
@@ -146,16 +157,18 @@ class DynamicsDraws(DrawsWithoutNoise):
 
     def residuals(self, x: Array, u: Array) -> Array:
         """Return the residuals ``(S, q, n)`` at states ``(S, q, n)`` and acting inputs ``(S, q, m)``."""
-        if not self.data.learned.any():
-            return np.zeros_like(x)
-        z = bounded(self.data.standardised(x, u))
-        parts = np.split(z, np.cumsum([len(each.weights) for each in self.expansions[:-1]], dtype=int))
-        learned = np.concatenate([each(part) for each, part in zip(self.expansions, parts, strict=True)])
-        if self.limit is not None:
-            learned = np.minimum(np.maximum(learned, -self.limit), self.limit)
-        residuals = np.zeros_like(x)
-        residuals[:, :, self.data.learned] = learned
-        return residuals * self.data.units
+        residuals, (at, units) = np.zeros(x.shape), self._moved
+        if len(at):
+            z = bounded(self.data.standardised(x, u))
+            groups = zip(self.expansions, pairwise(self._firsts), strict=True)
+            parts = [expansion(z[first:last]) for expansion, (first, last) in groups]
+            learned = np.concatenate(parts) if parts[1:] else parts[0]
+            if self.limit is not None:
+                np.maximum(learned, -self.limit, out=learned)
+                np.minimum(learned, self.limit, out=learned)
+            learned *= units
+            residuals[:, :, at] = learned
+        return residuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,5 +209,6 @@ def bounded(z: Array) -> Array:
     """Return standardised pairs within limits, in the same array: a loop that diverges stays finite; NaN becomes 0."""
     np.maximum(z, -1e6, out=z)
     np.minimum(z, 1e6, out=z)
-    z[np.isnan(z)] = 0.0
+    if math.isnan(np.vdot(z, z)):
+        z[np.isnan(z)] = 0.0
     return z

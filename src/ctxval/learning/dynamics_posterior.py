@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import ClassVar
 
@@ -31,7 +31,6 @@ from ctxval.learning.hyperparameters import (
     SMOOTHER_FAMILIES,
     HyperparameterPosterior,
     ResidualHyperparameters,
-    learning_rows,
 )
 from ctxval.learning.kernel_expansion import Component, KernelExpansion, draw_functions, joined
 from ctxval.learning.residual_data import ResidualData, residual_data, smoother_than, with_what_varies
@@ -83,6 +82,8 @@ class DynamicsPosterior(ShortRepr):
 
     covariances: LearnedCovariances
     data: ResidualData
+    # the process for each draw of the hyperparameters, by its identity
+    _of_draws: dict[int, Component] = field(default_factory=dict, init=False, repr=False)
 
     has_pivots: ClassVar[bool] = True  # whether draws are exact at some of the pairs that closed loops visit
 
@@ -102,14 +103,11 @@ class DynamicsPosterior(ShortRepr):
 
     def _components(self, rows: Iterable[int]) -> tuple[Component, ...]:
         components, drawn = [self.most_probable], self.covariances.drawn
-        last = drawn[0]
         for row in rows:
-            if drawn[row] is last:
-                components.append(components[-1].again(self._rng(row)))
-                continue
             with contextlib.suppress(InputError):  # its covariance matrix is not positive definite
-                components.append(self._component(drawn[row], self._rng(row)))
-                last = drawn[row]
+                if id(drawn[row]) not in self._of_draws:
+                    self._of_draws[id(drawn[row])] = self._component(drawn[row], self._rng(row))
+                components.append(self._of_draws[id(drawn[row])].again(self._rng(row)))
         return tuple(components)
 
     @functools.cached_property
@@ -324,9 +322,9 @@ def learn_covariances(
             model, data = smoother
             # S itself is smoother than the error of M, and takes more transitions.
             settings = replace(settings, centres=2 * settings.centres, families=SMOOTHER_FAMILIES)
-        Z, Y = data.pairs, data.outputs[:, data.learned]
-        rows = learning_rows(Z, data.inputs, settings.learned_from)
-        posterior = HyperparameterPosterior.given(Z[rows], Y[rows], data.inputs, settings.families)
+        Z, Y, rows = data.pairs, data.outputs[:, data.learned], data.learning_rows(settings.learned_from)
+        climb = functools.partial(data.climbed, rows=rows)
+        posterior = HyperparameterPosterior.given(Z[rows], Y[rows], data.inputs, settings.families, climb)
     return LearnedCovariances(model, smoother is not None, data.scale, posterior, settings, seed, data.geometry)
 
 

@@ -32,18 +32,18 @@ from ctxval.learning.effects.inputs import NO_EFFECTS, InputEffects
 from ctxval.learning.histories import Record
 from ctxval.learning.prediction import Executed
 from ctxval.learning.recorded import closed_loops_on_model, scheduled
-from ctxval.learning.state_estimates import StateEstimates
+from ctxval.learning.state_estimates import RecordedStates, StateEstimates, States
 
 
 def with_states_of_model(validation: Validation) -> Validation:
     """Return a validation, not to be executed, whose trajectories have the states of M; itself if it records states."""
-    if validation.outputs is None:
+    if not validation.outputs.hide_states:
         return validation
     return ExtendedValidation(validation.with_parts(physical=())).validation
 
 
-def estimates_by_loops_on_model(validation: Validation) -> StateEstimates | None:
-    """Return the estimates of states for a validation; None if no task can be planned, or if it has no outputs."""
+def estimates_by_loops_on_model(validation: Validation) -> States | None:
+    """Return the states of M along executions of a validation; None if no task can be planned."""
     return ExtendedValidation(validation.with_parts(physical=())).estimates
 
 
@@ -57,14 +57,14 @@ class ExtendedValidation:
         self,
         given: Validation,
         effects: InputEffects = NO_EFFECTS,
-        estimates: StateEstimates | None = None,
+        estimates: States | None = None,
     ) -> None:
         self.given, self.effects, self._known = given, effects, estimates
         self._acting = WeakKeyDictionary[Trajectory, Trajectory]()
         of_names = (np.arange(given.space.dimension)[given.space.columns(name)] for name in given.physical)
         self._columns = np.hstack([np.empty(0, dtype=np.intp), *of_names])
         # Whether only executions of tasks can be learned from: other recordings tell no parameters and no start.
-        changes = bool(given.physical) or given.outputs is not None
+        changes = bool(given.physical) or given.outputs.hide_states
         self.needs_tasks = changes or bool(effects.effects)
         self.validation = self._extended() if changes else given
 
@@ -90,10 +90,10 @@ class ExtendedValidation:
 
     def _labels(self) -> Labels:
         given, space, outputs = self.given, self.given.space, self.given.outputs
-        labels = given.labels if outputs is None else replace(given.labels, states=())
+        labels = replace(given.labels, states=()) if outputs.hide_states else given.labels
         with contextlib.suppress(Exception):  # the user's task, which is planned with its own errors elsewhere
             n = given.task(space.parameters(0.5 * (space.low + space.high))).initial_state.shape[-1]
-            if outputs is not None:
+            if outputs.hide_states:
                 names, recorded = [f"x{i}" for i in range(n)], outputs.indices or []
                 for i, label in zip(recorded, labels_of(given.names(len(recorded), 0)[0]), strict=True):
                     names[i] = label
@@ -137,11 +137,10 @@ class ExtendedValidation:
                 if trajectory not in self._acting:
                     self._acting[trajectory] = replace(trajectory, inputs=self.effects.acting(trajectory.inputs))
             acting = [(point, self._acting[trajectory]) for point, trajectory in executed]
-        if self.given.outputs is not None:
-            states = None if self.estimates is None else self.estimates.of(acting, some)
-            if states is None:
-                return None
-            acting = [(point, trajectory) for (point, _), trajectory in zip(acting, states, strict=True)]
+        states = None if self.estimates is None else self.estimates.of(acting, some)
+        if states is None:
+            return None
+        acting = [(point, trajectory) for (point, _), trajectory in zip(acting, states, strict=True)]
         if not len(self._columns):
             return acting
         values = [self.given.space.from_unit(point)[self._columns] for point, _ in acting]
@@ -155,9 +154,11 @@ class ExtendedValidation:
         return ExtendedValidation(given, self.effects, self.estimates)
 
     @functools.cached_property
-    def estimates(self) -> StateEstimates | None:
-        """The estimates of the states of M; None if no task can be planned, or if there are no outputs."""
-        if self.given.outputs is None or self.loops is None or self._known is not None:
+    def estimates(self) -> States | None:
+        """The states of M along executions; None if they must be estimated and no task can be planned."""
+        if not self.given.outputs.hide_states:
+            return RecordedStates()
+        if self.loops is None or self._known is not None:
             return self._known
         states = self.loops.states[..., : self.loops.states.shape[-1] - len(self._columns)]
         return StateEstimates(self.given, self.given.outputs, states)
@@ -166,7 +167,7 @@ class ExtendedValidation:
         """Return a closed loop, with the inputs that are commanded, as the system records it."""
         if len(self._columns):
             trajectory = replace(trajectory, states=trajectory.states[..., : -len(self._columns)])
-        return trajectory if self.given.outputs is None else self.given.outputs.of(trajectory)
+        return self.given.outputs.of(trajectory)
 
     def records(self, executed: Executed) -> list[Record]:
         """Return executions of the other validation with the inputs that act, and the initial states of their tasks."""
@@ -233,7 +234,7 @@ class _ExtendedSynthesizer:
 
     synthesizer: Synthesizer
     model: Model | None
-    outputs: Outputs | None
+    outputs: Outputs
     k: int
 
     @property
@@ -242,7 +243,7 @@ class _ExtendedSynthesizer:
 
     def design(self, task: Task, model: Model) -> Controller:
         designed = self.synthesizer.design(_plain(task), model if self.model is None else self.model)
-        controller = designed if self.outputs is None else self.outputs.seen_by(designed)
+        controller = self.outputs.seen_by(designed)
         return seeing(controller, lambda x: x[..., : -self.k], _plain) if self.k else controller
 
 

@@ -22,6 +22,7 @@ from ctxval.gp.kernels import Covariance, Matern, Towards
 from ctxval.gp.regression import most_likely
 
 FAMILIES = ((2.5, 0.0), (2.5, 1.0), (1.5, 0.0))  # smoothness and growth of the covariances, equally likely a priori
+Climbs = list[tuple[float, Array]]  # log posteriors at the ends of climbs, and the (theta, log noise) there
 SMOOTHER_FAMILIES = ((4.5, 0.0), *FAMILIES)  # those of the system itself, without a learned model, which may be rough
 
 
@@ -170,12 +171,18 @@ class HyperparameterPosterior:
     families: tuple[tuple[Mode, ...], ...]
 
     @classmethod
-    def given(cls, Z: Array, Y: Array, inputs: int, families: Sequence[tuple[float, float]]) -> HyperparameterPosterior:
-        """Return the posterior given standardised pairs ``(N, k)`` and residuals ``(N, n)``."""
-        modes = []
+    def given(
+        cls, Z: Array, Y: Array, inputs: int, families: Sequence[tuple[float, float]],
+        climb: Callable[[ResidualKernel], Climbs] | None = None,
+    ) -> HyperparameterPosterior:  # fmt: skip
+        """Return the posterior given standardised pairs ``(N, k)`` and residuals ``(N, n)``.
+
+        By default, each family is climbed; ``climb`` may know the climbs of some.
+        """
+        climb, modes = climb or (lambda kernel: climbed(kernel, Z, Y)), []
         for nu, growth in families:
             kernel = ResidualKernel(nu, growth, inputs)
-            (height, place), (lower, other) = ends = climbed(kernel, Z, Y)
+            (height, place), (lower, other) = ends = climb(kernel)
             relevant = height - lower < 12.0 and np.abs(place - other).max() > 0.5  # else negligible, or the same mode
             modes.append(tuple(Mode(kernel, *end, Z, Y) for end in (ends if relevant else ends[:1])))
         return cls(tuple(modes))
@@ -269,7 +276,7 @@ def _log_likelihood(K: Array, noise: float, Y: Array) -> tuple[float, CholeskyFa
     return float(value), factor, weights / np.sqrt(squares)
 
 
-def climbed(kernel: ResidualKernel, Z: Array, Y: Array) -> list[tuple[float, Array]]:
+def climbed(kernel: ResidualKernel, Z: Array, Y: Array) -> Climbs:
     """Return the log posterior and its place where climbs from little and from much noise end, the highest first."""
     density = functools.partial(log_posterior, kernel, Z=Z, Y=Y)
     bounds = list(zip(*kernel.box(Z.shape[1]), strict=True))

@@ -13,7 +13,7 @@ from itertools import groupby, product
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
-from ctxval.gp.cholesky import CholeskyFactor, factorise, pivoted_cholesky
+from ctxval.gp.cholesky import CholeskyFactor, factorise, pivoted_cholesky, pivoted_matrix
 from ctxval.learning.hyperparameters import ResidualHyperparameters, ResidualKernel
 
 
@@ -164,7 +164,8 @@ class Component:
         """Return ``L^-1 k(centres, Z)``, shape ``(M, N)``, and the posterior variance ``(N,)`` for unit amplitudes."""
         kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
         # For many pairs, a product with the inverse factor is several times as fast as substitution.
-        half = self.factor.whiten_many(kernel(theta, Z, self.centres).T)
+        whiten = self.factor.whiten_many if len(Z) > len(self.centres) else self.factor.whiten
+        half = whiten(kernel(theta, Z, self.centres).T)
         return half, np.maximum(kernel.diagonal(theta, Z) - (half**2).sum(axis=0), 0.0)
 
 
@@ -182,15 +183,15 @@ def draw_functions(
     largest = left.max(initial=0.0)
     # Variances below the noise are drawn too: many noisy transitions determine a function better than one does.
     rounding = 1e-13 * kernel.diagonal(theta, relevant).max(initial=0.0)
-    towards, few = kernel.towards(theta, relevant), len(relevant) <= 300
-    covariance = towards(relevant) - half.T @ half if few else None  # cheaper than one row after the other
+    towards, least = kernel.towards(theta, relevant), max(1e-6 * largest, rounding)
+    if len(relevant) <= 300:  # cheaper than one row after the other
+        chosen, L, left = pivoted_matrix(left, towards(relevant) - half.T @ half, pivots, least)
+    else:
 
-    def covariances(row: int) -> Array:
-        if covariance is not None:
-            return np.asarray(covariance[row])
-        return np.asarray(towards(relevant[row : row + 1])[0] - half[:, row] @ half)
+        def covariances(row: int) -> Array:
+            return np.asarray(towards(relevant[row : row + 1])[0] - half[:, row] @ half)
 
-    chosen, L, left = pivoted_cholesky(left, covariances, pivots, least=max(1e-6 * largest, rounding))
+        chosen, L, left = pivoted_cholesky(left, covariances, pivots, least)
     left_out = float(left.max() / largest) if largest > rounding else 0.0
     if not len(chosen):
         weights = np.repeat(first.weights[None], count * len(alike), axis=0)
@@ -200,7 +201,8 @@ def draw_functions(
     normal = np.concatenate([rng.standard_normal(shape) * component.amplitudes for component in alike])
     # The values L xi at the pivots are interpolated by the posterior covariance L L', with weights L'^-1 xi.
     weights = np.linalg.solve(L.T, normal)
-    cross = first.factor.solve(kernel(theta, first.centres, at))
-    together = np.concatenate([first.weights - np.matmul(cross, weights), weights], axis=1)
+    columns = np.matmul(half[:, chosen], weights).swapaxes(0, 1)
+    known = first.factor.unwhiten(columns.reshape(len(half), -1)).reshape(columns.shape).swapaxes(0, 1)
+    together = np.concatenate([first.weights - known, weights], axis=1)
     centres = np.concatenate([first.centres, at])
     return KernelExpansion.of(first.hyperparameters, centres, together), left_out

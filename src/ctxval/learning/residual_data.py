@@ -8,7 +8,7 @@ itself only few. The data decide: both models explain the same recorded transiti
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from ctxval.core.model import Model, predicted_steps
 from ctxval.core.state_geometry import PLAIN, StateGeometry, geometry_of
 from ctxval.core.trajectory import Transitions
 from ctxval.learning.dry_friction import DryFriction
-from ctxval.learning.hyperparameters import FAMILIES, ResidualKernel, climbed, learning_rows
+from ctxval.learning.hyperparameters import FAMILIES, Climbs, ResidualKernel, climbed, learning_rows
 from ctxval.models.increments import standard_deviations, standardised_pairs
 from ctxval.models.linear import Linear
 
@@ -63,6 +63,22 @@ class ResidualData:
     executed: Mask
     executions: Transitions  # those of executions, also of joints that friction holds
     geometry: StateGeometry = PLAIN  # of the states of M
+    # what was learned before: rows by their number, and climbs by their kernel and rows
+    _rows: dict[int, Rows] = field(default_factory=dict, init=False, repr=False)
+    _climbs: dict[tuple[ResidualKernel, bytes], Climbs] = field(default_factory=dict, init=False, repr=False)
+
+    def learning_rows(self, count: int) -> Rows:
+        """Return ``count`` well-spread transitions, from which hyperparameters are learned."""
+        if count not in self._rows:
+            self._rows[count] = learning_rows(self.pairs, self.inputs, count)
+        return self._rows[count]
+
+    def climbed(self, kernel: ResidualKernel, rows: Rows) -> Climbs:
+        """Return where climbs of the log posterior of hyperparameters end, given some transitions."""
+        key = kernel, rows.tobytes()
+        if key not in self._climbs:
+            self._climbs[key] = climbed(kernel, self.pairs[rows], self.outputs[rows][:, self.learned])
+        return self._climbs[key]
 
     def standardised(self, x: Array, u: Array) -> Array:
         """Return standardised pairs ``(..., n + m)`` of states and acting inputs."""
@@ -135,7 +151,7 @@ def smoother_than(data: ResidualData, count: int) -> tuple[Model, ResidualData] 
     deviations = predicted - _fitted(known, predicted).step(known.x, known.u)
     if (np.sqrt((deviations**2).mean(axis=0)) <= 1e-3 * data.sizes).all():
         return None  # the model of these residuals is linear itself, as far as it matters for them
-    rows = learning_rows(data.pairs, data.inputs, count)
+    rows = data.learning_rows(count)
     needed = _log_density(data, rows) + len(rows) * len(data.sizes)  # a gain of 1 for each recorded number
     # If S itself is linear, its linear model leaves no residual. The change of its state has the same prior.
     for linear in (_fitted(known, known.x_next), Identity()):
@@ -161,7 +177,7 @@ def with_what_varies(
     every = residual_data(model, transitions, sources, geometry=StateGeometry(data.geometry.quaternions))
     if every is None or len(every.pairs) != len(data.pairs):
         return data
-    rows = learning_rows(every.pairs, data.inputs, count)
+    rows = every.learning_rows(count)
     gain = _log_density(every, rows) - _log_density(data, rows)
     if not gain > better * len(rows) * max(1, int(data.learned.sum())):
         return data
@@ -186,7 +202,7 @@ def _log_density(data: ResidualData, rows: Rows) -> float:
     """Return the log density of transitions in the units of the system, up to a constant that all models share."""
     sizes = np.maximum(data.sizes, NEGLIGIBLE * data.steps)
     kernel = ResidualKernel(*FAMILIES[0], data.inputs)
-    learned, _ = climbed(kernel, data.pairs[rows], data.outputs[rows][:, data.learned])[0]
+    learned, _ = data.climbed(kernel, rows)[0]
     return learned - len(rows) * float(np.log(sizes).sum())
 
 

@@ -23,6 +23,14 @@ from ctxval.models.corrected import before_refinement
 from ctxval.models.increments import standard_deviations
 
 
+class RecordedStates:
+    """The states of M along executions, if they are recorded."""
+
+    def of(self, executed: Executed, judged: int) -> list[Trajectory]:
+        """Return the executions as they are."""
+        return [trajectory for _, trajectory in executed]
+
+
 class StateEstimates:
     """The states of M along executions, estimated from their inputs and outputs; they are kept like these.
 
@@ -77,6 +85,9 @@ class StateEstimates:
             kept, times = trajectory.horizon - end, trajectory.times
             estimated.append(Trajectory(times[: kept + 1], states[: kept + 1, chosen], trajectory.inputs[:kept]))
         return estimated
+
+
+States = RecordedStates | StateEstimates
 
 
 def smoothed_states(

@@ -88,7 +88,7 @@ class StructureSearch:
                 "inputs that act late", settings.inputs, lambda costs: costs.input_effects(single),
                 self.with_inputs, lambda study: bool(study.effects),
             ),
-            *([friction] if plain.given.outputs is None else []),
+            *([] if plain.given.outputs.hide_states else [friction]),
             Part("the data of M", settings.data, Costs.learning, _without_data, lambda study: not study.with_data),
             Part(
                 "parameters that change the dynamics", settings.parameter, lambda costs: names * costs.learning(),
@@ -163,7 +163,7 @@ class StructureSearch:
 
     def with_inputs(self, study: DynamicsStudy, executed: Executed, before: Found = ()) -> DynamicsStudy | None:
         """Return a study with the effects of inputs that executions show; those found before are the first guess."""
-        given, estimated = study.given, study.given.outputs is not None
+        given, estimated = study.given, study.given.outputs.hide_states
         if study.friction is not None:
             return None  # its steps at rest teach nothing of inputs that act late
         among = executed[-self.settings.estimated_from :] if estimated else executed

@@ -46,14 +46,14 @@ class Linear:
             raise InputError("a linear model needs finite transitions, got NaN or infinity.")
         columns = [data.x, data.u, *([np.ones((len(data), 1))] if intercept else [])]
         regressors = np.concatenate(columns, axis=1)
-        with single_threaded():
+        with single_threaded(scipy=False):
             weights, _, rank, _ = np.linalg.lstsq(regressors, data.x_next)
         if rank < regressors.shape[1]:
             have = f"{len(data)} transitions of {n} states and {m} inputs have rank {rank}"
             needed = f"{regressors.shape[1]} is needed; excite every state and input"
             raise InputError(f"the data do not determine a linear model: {have}, and {needed}.")
         # No regressor may nearly be a linear combination of the others, independently of units.
-        with single_threaded():
+        with single_threaded(scipy=False):
             _, sizes, directions = np.linalg.svd(regressors / np.linalg.norm(regressors, axis=0), full_matrices=False)
         if sizes[0] > 1e8 * sizes[-1]:  # half of the digits; beyond it rounding and noise determine the weights
             names = [*(f"x{i}" for i in range(n)), *(f"u{i}" for i in range(m)), "the constant"]

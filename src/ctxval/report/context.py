@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -15,7 +16,6 @@ from ctxval._util.representation import ShortRepr
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.dynamics import NEAR, CampaignDynamics
 from ctxval.campaign.envelope import has_tests
-from ctxval.campaign.interval_search import with_next_task
 from ctxval.campaign.storage.other_stores import provenance_of_store
 from ctxval.campaign.storage.store import CAUSE, Store
 from ctxval.certificates import Certificate, CertificateOptions, Provenance, Verdict, judge
@@ -62,6 +62,7 @@ class ReportContext(ShortRepr):
     budget: int | None = None  #: the budget of the campaign; None if it is not known
     provenance: Provenance = field(default_factory=Provenance)  #: what a certificate knows besides the trials
     envelope: Envelope | None = None  #: the tasks on which the threshold is kept; None if it was not computed
+    thinking: float | None = None  #: seconds for what pictures need of learned dynamics; None for the default
 
     @functools.cached_property
     def settings(self) -> Mapping[str, Any]:
@@ -135,6 +136,11 @@ class ReportContext(ShortRepr):
     def suite(self) -> TaskSuite | None:
         """The suite of tasks; None if tasks fill a box."""
         return self.space if isinstance(self.space, TaskSuite) else None
+
+    @property
+    def axes(self) -> int:
+        """The number of parameters along which the distance is drawn: 0 in a suite, which has no tasks between its."""
+        return 0 if self.suite else self.space.dimension
 
     @property
     def task_labels(self) -> tuple[str, ...]:
@@ -228,12 +234,20 @@ class ReportContext(ShortRepr):
     @functools.cached_property
     def distance_model(self) -> DistanceModel | None:
         """The distance over the tasks as the trials show it; None if it cannot be fitted."""
-        return DistanceModel.of(self.completed, self.space.members)
+        return DistanceModel.of(self.completed, self.space)
 
     @property
     def batched(self) -> bool:
         """Whether the experiment is loaded, and its synthesizer designs many controllers at once."""
         return self.validation is not None and bool(getattr(self.validation.synthesizer, "batched", False))
+
+    @contextmanager
+    def thinks(self) -> Iterator[CampaignDynamics]:
+        """Give the learned dynamics, whose budget is meanwhile that of the report."""
+        assert self.dynamics is not None
+        with self.dynamics.thinking.limited(self.thinking):
+            self.dynamics.thinking.measure(self.trials)
+            yield self.dynamics
 
     @functools.cached_property
     def replays(self) -> dict[int, Replay]:
@@ -242,8 +256,9 @@ class ReportContext(ShortRepr):
             return {}
         # Designs that cannot be made in a batch take long.
         points = [pair.trial.unit_point for pair in self.recordings.values()][: 120 if self.batched else 40]
-        with stage("replaying executed tasks", len(points), "tasks"):
-            replays = replay_executed(self.validation, self.dynamics.learned(self.trials), points)
+        with stage("replaying executed tasks", len(points), "tasks"), self.thinks() as dynamics:
+            learned = dynamics.learned(self.trials) if dynamics.affords(self.trials, len(points)) else None
+            replays = replay_executed(self.validation, learned, points)
         return {k: replay for k, replay in zip(self.recordings, replays, strict=False) if replay is not None}
 
 
@@ -255,19 +270,19 @@ def context_of_campaign(
     certificate: CertificateOptions | None = None,
     budget: int | None = None,
     envelope: Envelope | None = None,
+    thinking: float | None = None,
 ) -> ReportContext:
     """Return what a report of a campaign is made from.
 
     Its verdict is ``verdict``, if that was computed before, or else that against ``threshold`` by ``certificate``. If
-    it is falsified and the tests of an envelope were executed, the envelope is ``envelope`` or computed.
+    it is falsified and the tests of an envelope were executed, the envelope is ``envelope`` or computed. Verdict and
+    pictures take at most ``thinking`` seconds each, as in :meth:`ctxval.Campaign.verdict`; infinity for no limit.
     """
     options = certificate or CertificateOptions()
     known = campaign.provenance
     if verdict is None and threshold is not None:
         # A report only reads: it does not record that the threshold was stated.
-        with stage("certifying"):
-            known = campaign.provenance_for(options, threshold)
-            verdict = with_next_task(judge(campaign.trials, threshold, options, known), campaign.recorder, options)
+        verdict, known = campaign.judged(threshold, options, thinking)
     falsified = verdict is not None and verdict.answer == "falsified"
     if envelope is None and verdict is not None and falsified and has_tests(campaign.recorder, options):
         envelope = campaign.envelope(verdict.threshold, options.confidence, certificate=options)
@@ -283,6 +298,7 @@ def context_of_campaign(
         budget=budget,
         provenance=known,
         envelope=envelope,
+        thinking=thinking,
     )
 
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
+from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Trial
 from ctxval.gp.regression import GaussianProcess
 from ctxval.gp.surrogate import SurrogateHyperparameters, learn, spread_rows
@@ -37,10 +38,10 @@ class DistanceModel:
     values: Array  #: their distances ``(n,)``
     learned: SurrogateHyperparameters  #: its hyperparameters and its scale
     process: GaussianProcess  #: the process, conditioned on the distances
-    suite: Array | None = None  #: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box
+    tasks: Array  #: random tasks, or all tasks of a suite, points of the unit cube ``(m, d)``
 
     @classmethod
-    def of(cls, completed: Sequence[Trial], suite: Array | None = None) -> DistanceModel | None:
+    def of(cls, completed: Sequence[Trial], space: TaskSpace) -> DistanceModel | None:
         """Return the model of trials with a distance; None if they are fewer than two, or none can be fitted."""
         if len(completed) < 2:
             return None
@@ -50,7 +51,8 @@ class DistanceModel:
         with single_threaded(), np.errstate(all="ignore"):
             learned = learn(points, values)
             process = learned.condition(points, values)
-        return cls(points, values, learned, process, suite) if np.isfinite(process.alpha).all() else None
+        tasks = space.candidates(np.random.default_rng(0).random((4096, space.dimension)))
+        return cls(points, values, learned, process, tasks) if np.isfinite(process.alpha).all() else None
 
     def predict(self, points: Array) -> Band:
         """Return the distances predicted at points of the unit cube ``(m, d)``."""
@@ -67,11 +69,6 @@ class DistanceModel:
         """Root mean square of the standardised leave-one-out errors; about 1 if the bands are as wide as the errors."""
         mean, variance = self.process.left_out()
         return float(np.sqrt(np.mean((self.process.y - mean) ** 2 / np.maximum(variance, 1e-300))))
-
-    @functools.cached_property
-    def tasks(self) -> Array:
-        """Random tasks, or all tasks of a suite, points of the unit cube ``(m, d)``."""
-        return self.suite if self.suite is not None else np.random.default_rng(0).random((4096, self.points.shape[1]))
 
     @functools.cached_property
     def over_tasks(self) -> Band:

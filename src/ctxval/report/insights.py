@@ -101,7 +101,8 @@ def explained(context: ReportContext) -> Answer | None:
         f"M with a residual that is learned from the other trials predicts the distances of {len(pairs)} trials with "
         f"an error of {quantity(error, context.labels.units)} (root mean square), {percent(left)} of the distances."
     )
-    of = "the recorded state" if context.validation.outputs is None else state_of(estimated=True)
+    estimated = context.validation.outputs.hide_states
+    of = f"{'' if estimated else 'the '}{state_of(estimated)}"
     if share >= 0.8:
         difference = f"the difference is a function of {of} and input"
         fitted = "a model that is fitted to these data can remove it"

@@ -221,7 +221,7 @@ def picture(context: ReportContext) -> str:
     40 are shown. It is empty if no distance is known.
     """
     trials = sorted(context.worst_first[:40], key=lambda trial: trial.number)
-    along = context.space.dimension == 1 and context.suite is None
+    along = context.axes == 1
     names = [str(trial.number) for trial in trials]
     if along:
         trials.sort(key=lambda trial: float(trial.unit_point[0]))

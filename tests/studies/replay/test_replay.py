@@ -101,7 +101,7 @@ def test_friction_that_the_model_lacks_is_an_affine_function_of_the_state() -> N
     assert max(one.ratio for one in fast) > 1.4
     shares = np.array([one.count for one in fast]) / RECORDED.steps
     assert shares @ np.square([one.ratio for one in fast]) == pytest.approx(1.0, rel=1e-9)
-    assert repr(report).startswith("ReplayReport\n  data: RecordedData(sources=('run 0', 'run 1',")
+    assert repr(report).startswith("ReplayReport(data=RecordedData(sources=('run 0', 'run 1',")
 
 
 def test_a_nonlinear_residual_is_explained_by_a_function_that_is_not_affine() -> None:

@@ -103,15 +103,10 @@ def _space(validation: Validation) -> Findings:
 def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Findings:
     """Plan the lowest, the middle, the highest and eight random tasks; of a suite, eleven of its tasks."""
     space, rng = validation.space, np.random.default_rng(seed)
-    if space.members is not None:
-        points = rng.permutation(space.from_unit(space.members))[:11]
-    else:
-        corners = np.stack([space.low, 0.5 * (space.low + space.high), space.high])
-        points = np.concatenate([corners, space.iid(8, rng)])
-    plans.extend([validation.plan(point) for point in points])
+    plans.extend([validation.plan(point) for point in space.examples(8, rng)])
     task, on_model = plans[0].task, plans[0].model_trajectory
     n, recorded = task.initial_state.shape[-1], on_model.states.shape[-1]
-    states = f"{n} states" if validation.outputs is None else f"{recorded} outputs of {n} states"
+    states = f"{recorded} outputs of {n} states" if validation.outputs.hide_states else f"{n} states"
     sizes = f"{states}, {on_model.inputs.shape[-1]} inputs"
     yield "ok", f"{len(plans)} tasks planned: {sizes}, {task.horizon} steps of {task.dt:g} s"
     require_repeatable(validation, plans[0])
@@ -197,8 +192,7 @@ def _model(validation: Validation, counts: Mapping[str, int]) -> Findings:
 def _small_changes(validation: Validation) -> Findings:
     """State how far small changes move closed loops of M, if these are not smooth."""
     study, settings = DynamicsStudy(validation), ThinkingSettings()
-    points = validation.space.unit_draws(16, np.random.default_rng(0)) if validation.space.members is None else None
-    speed = None if points is None else Speed.measured(study.validation, points, settings)
+    speed = Speed.measured(study.validation, validation.space.unit_draws(16, np.random.default_rng(0)), settings)
     if speed is not None:
         found = found_sensitivity(study.planner, Thinking(settings.default, settings.default, speed))
         if found is not None:

@@ -33,8 +33,7 @@ def distances(context: ReportContext) -> Markup:
     if model is None:
         return paragraph("Fewer than two distances are known, so no picture of the distance can be drawn.")
     predicted, d = _predicted(context, model), context.space.dimension
-    # The distance over one parameter is on the first screen; a suite has no tasks between its own.
-    if d == 1 or context.suite is not None:
+    if context.axes <= 1:  # the distance over one parameter is on the first screen
         return joined([element("div", predicted, class_="charts")])
     parts = [paragraph("Lines, bands and maps are pictures of what the trials suggest, and no certificate.")]
     if d == 2:  # the map is on the first screen
@@ -64,10 +63,11 @@ def _estimated(context: ReportContext, unit: Array) -> Band | None:
     errors = np.array([replay.distance - context.recordings[k].distance for k, replay in context.replays.items()])
     if model is None or (errors**2).mean() <= ((model.left_out.median - model.values) ** 2).mean():
         # The user's parts, at states that no execution has reached, must not end a report.
-        with suppress(Exception), stage("predicting distances", len(unit), "tasks"):
-            values = dynamics.expected(context.trials, unit, len(context.trials))
-            if np.isfinite(values).any():
-                return Band(values, values, values)
+        with suppress(Exception), stage("predicting distances", len(unit), "tasks"), context.thinks():
+            if dynamics.affords(context.trials, len(unit)):
+                values = dynamics.expected(context.trials, unit, len(context.trials))
+                if np.isfinite(values).any():
+                    return Band(values, values, values)
     return None if model is None else model.predict(unit)
 
 
@@ -78,8 +78,8 @@ def over_tasks(context: ReportContext) -> Markup | Chart | None:
     A suite has no tasks between its own, so its distances are in the order of execution.
     """
     picture: Markup | Chart | None = None
-    if context.suite is None and context.completed:
-        picture = distance_along(context, 0) if context.space.dimension == 1 else _map(context)
+    if context.axes and context.completed:
+        picture = distance_along(context, 0) if context.axes == 1 else _map(context)
     return picture or distances_in_order(context)
 
 
@@ -255,7 +255,7 @@ def envelope(context: ReportContext) -> Markup:
     if known is None:
         return Markup()
     stated = None if known.doubt is not None else paragraph(text(known.statement, UNCUT))
-    has_picture = known.doubt is None and context.suite is None and known.share > 0
+    has_picture = known.doubt is None and bool(context.axes) and known.share > 0
     drawn, words = _trusted_tasks(context, known) if has_picture else None, paragraph(text(known.words, UNCUT))
     return element("div", heading("Where the model can be trusted"), stated, words, drawn, class_="envelope")
 

@@ -14,7 +14,6 @@ from ctxval._util.representation import ShortRepr
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import at_points, executed_trials
 from ctxval.core.plan import Plan, observation_delay
-from ctxval.core.system import System, WithOutputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
@@ -83,7 +82,7 @@ class ClosedLoops:
         """
         loops = self._noisy(repaired, execution, noise)
         if not loops:
-            start = None if self.validation.outputs is not None else execution.executed.states[0]
+            start = None if self.validation.outputs.hide_states else execution.executed.states[0]
             loop = self.of_plan(repaired, execution.plan, execution.executed.horizon, start)
             if loop is None:
                 return Predicted(np.inf, np.zeros(1), np.inf)
@@ -106,9 +105,7 @@ class ClosedLoops:
         self, repaired: ModelWithEffects, plan: Plan, steps: int, start: Array | None = None
     ) -> Trajectory | None:
         """Return the first steps of a plan's closed loop on a model with causes, without noise; None if it fails."""
-        system: System = repaired
-        if self.validation.outputs is not None:
-            system = WithOutputs(repaired, self.validation.outputs)
+        system = self.validation.outputs.recording(repaired)
         try:
             loop = system.execute(plan.controller, plan.task if start is None else plan.task.starting_at(start))
         except Exception:  # the user's own parts, at states that they never saw
@@ -171,7 +168,7 @@ def find_causes(campaign: Campaign, *, most: int = 2, settings: CauseSettings = 
     validation = campaign.validation
     trials = sorted(executed_trials(campaign.store, campaign.trials), key=lambda pair: -(pair[0].distance or 0.0))
     failed = list[tuple[Trial, Trajectory]]()
-    for trial in campaign.failed if validation.outputs is None else ():
+    for trial in () if validation.outputs.hide_states else campaign.failed:
         nominal, run = campaign.trajectories(trial)
         if nominal is not None and run is not None and len(failed) < settings.failed:
             # What was recorded until the system left the surroundings of what M promised.
@@ -187,13 +184,10 @@ def find_causes(campaign: Campaign, *, most: int = 2, settings: CauseSettings = 
         )
     executed = at_points(trials)
     with single_threaded():
-        states = [run for _, run in executed]
-        if validation.outputs is not None:
-            estimates = estimates_by_loops_on_model(validation)
-            estimated = None if estimates is None else estimates.of(executed, len(executed))
-            if estimated is None:
-                raise InputError("the states of the model cannot be estimated from the recorded outputs.")
-            states = estimated
+        estimates = estimates_by_loops_on_model(validation)
+        states = None if estimates is None else estimates.of(executed, len(executed))
+        if states is None:
+            raise InputError("the states of the model cannot be estimated from the recorded outputs.")
         plan = validation.plan
         executions = [ExecutedTask(plan(validation.space.from_unit(point)), run) for point, run in executed]
         return replace(_Study(validation, executions, states, settings).report(most), failed=len(failed))
@@ -205,7 +199,7 @@ class _Study:
     ) -> None:
         self.validation, self.executions, self.model = validation, executions, validation.model
         self.settings = settings
-        self.outputs = validation.outputs is not None
+        self.outputs = validation.outputs.hide_states
         horizon = min(len(run.inputs) for run in runs)
         # What inputs and jumps of the records tell is known, and not fitted.
         old = observation_delay([(each.plan.controller, each.plan.task, each.executed) for each in executions])

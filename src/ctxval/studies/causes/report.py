@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.representation import ShortRepr, call, line, lines, task_text
+from ctxval._util.representation import ShortRepr, call, task_text
 from ctxval.learning.effects import Effect, ModelWithEffects
 from ctxval.learning.effects.fit import Explanation
 from ctxval.learning.effects.plant import Plant
@@ -202,4 +202,4 @@ class CauseReport(ShortRepr):
         }
 
     def __repr__(self) -> str:
-        return lines(call(self, executions=self.executions, tried=self.tried), line(self.sentence))
+        return call(self, self.sentence, executions=self.executions, tried=self.tried)

@@ -82,10 +82,12 @@ def compare(
 
     made = [Candidate(str(name), campaign(str(name), compared), seed) for name, compared in candidates.items()]
     require_comparable({candidate.name: candidate.campaign.validation for candidate in made})
-    if question == "mean" and made[0].campaign.validation.space.members is not None:
+    possible: tuple[Question, ...] = ("worst", "mean")
+    if made[0].campaign.validation.space.members is not None:
+        possible = ("worst",)
+    if question == "mean" and question not in possible:
         raise InputError("question must be worst for a suite of tasks, which has no random draws, got 'mean'.")
-    both: tuple[Question, ...] = ("worst", "mean") if made[0].campaign.validation.space.members is None else ("worst",)
-    questions: tuple[Question, ...] = both if question == "both" else (question,)
+    questions: tuple[Question, ...] = possible if question == "both" else (question,)
     each = 1 - (1 - confidence) / len(questions)
     executions = Executions(made, largest_possible, on_trial or (lambda name, trial: None))
     worst, mean = WorstQuestion(executions, each, budget), MeanQuestion(executions, each, seed)

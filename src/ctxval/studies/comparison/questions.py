@@ -24,7 +24,6 @@ from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.bounds import ERRORS
 from ctxval.certificates.difference import MeanDifference, PairedDifferences, mean_difference
 from ctxval.certificates.limits import LIMITS
-from ctxval.certificates.sample import SAME
 from ctxval.core.trial import Trial
 from ctxval.studies.comparison.candidates import Candidate, Decision, Executions, TrialNote
 from ctxval.studies.comparison.result import PairResult
@@ -72,7 +71,7 @@ class WorstQuestion:
             if self._needs_fact(better, worse, expected) and worse.recorder.has_tasks:
                 value, task = expected[worse.name]
                 points = np.array([trial.unit_point for trial in worse.recorder.trials])
-                near = NEAR if self.candidates[0].campaign.validation.space.members is None else SAME
+                near = self.candidates[0].campaign.validation.space.near(NEAR)
                 if task is None or (len(points) and np.abs(points - task).max(axis=1).min() <= near):
                     self._execute(worse, Choice())  # no new task: the choice of the search
                 else:

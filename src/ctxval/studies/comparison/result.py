@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.representation import ShortRepr, call, line, lines
+from ctxval._util.representation import ShortRepr, call
 from ctxval.certificates.bounds import at_most
 from ctxval.core.space import Point
 from ctxval.studies.comparison.candidates import Question
@@ -74,7 +74,7 @@ class PairResult:
         return WORDS[self.question], *names, estimate, interval, str(self.tasks)
 
     def __repr__(self) -> str:
-        return lines(call(self, self.question, self.first, self.second, smaller=self.smaller), line(self.reason))
+        return call(self, self.question, self.first, self.second, smaller=self.smaller, reason=self.reason)
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,7 @@ class Comparison:
 
     def __repr__(self) -> str:
         known = {name: getattr(self, name) for name in ("confidence", "executions", "budget", "decided")}
-        rankings = (f"{WORDS[question]}: {line(self.ranking_text(question))}" for question in self.questions)
-        return lines(call(self, **known), *rankings)
+        return call(self, *map(self.ranking_text, self.questions), **known)
 
 
 def _number(value: float | None) -> str:

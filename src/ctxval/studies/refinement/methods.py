@@ -127,8 +127,7 @@ class CauseRepair(ShortRepr, Method):
         return report
 
     def learn(self, model: Model, records: Records) -> Learned:
-        if self.campaign.validation.outputs is not None:
-            raise InputError("the method 'causes' needs recorded states of M, and only outputs are recorded.")
+        self.campaign.validation.require_states("the method 'causes'")
         best = self.report.explained[0].explanation
 
         def repaired(some: Records) -> ModelWithEffects:

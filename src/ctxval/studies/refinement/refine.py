@@ -28,7 +28,7 @@ from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
 from ctxval.learning.extended import estimates_by_loops_on_model, with_states_of_model
 from ctxval.learning.recorded import closed_loops_on_model
-from ctxval.learning.state_estimates import StateEstimates
+from ctxval.learning.state_estimates import States
 from ctxval.models import Corrected, Linear, Refined, read_refined, write_model
 from ctxval.models.corrected import before_refinement
 from ctxval.models.saved import is_savable, read_note
@@ -225,8 +225,6 @@ class _Loop:
     def _with_states(self, rounds: list[Round], judged: int | None = None) -> list[Trajectory]:
         """Return executions; with states of M, estimated as the first ``judged`` choose, if outputs are recorded."""
         executed = at_points(self._executed(rounds))
-        if self.first.validation.outputs is None:
-            return [trajectory for _, trajectory in executed]
         judged = len(executed) if judged is None else judged
         estimated = None if self._estimates is None else self._estimates.of(executed, judged)
         if estimated is None:
@@ -237,7 +235,7 @@ class _Loop:
         return estimated
 
     @functools.cached_property
-    def _estimates(self) -> StateEstimates | None:
+    def _estimates(self) -> States | None:
         return estimates_by_loops_on_model(self.first.validation)
 
     def _beside(self, number: int, suffix: str) -> Path | None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from ctxval._util.describe import describe
 from ctxval._util.files import MADE_BY, write_text
-from ctxval._util.representation import ShortRepr, Shown, call, counted, line, lines
+from ctxval._util.representation import ShortRepr, call, counted
 from ctxval._util.texts import aligned
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates.verdict import Answer, Verdict
@@ -182,8 +182,8 @@ class Refinement:
         }
 
     def __repr__(self) -> str:
-        head = call(self, Shown(self.answer), threshold=self.threshold, executions=self.executions)
-        return lines(head, f"ended: {line(self.ended)}", *(line(row) for row in self.text.splitlines()[1:4]))
+        known = {"threshold": self.threshold, "executions": self.executions, "ended": self.ended}
+        return call(self, self.answer, **known)
 
 
 def write_refined(path: str | Path, refinement: Refinement, step: str | None = None) -> list[str]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ctxval._util.checked import PositiveInt, checked
 from ctxval._util.progress import progress_shown, stage
-from ctxval._util.representation import ShortRepr, Shown, call, lines
+from ctxval._util.representation import ShortRepr, call
 from ctxval._util.texts import parted
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import at_points, executed_trials
@@ -103,8 +103,7 @@ class SafetyReport(ShortRepr):
         )
 
     def __repr__(self) -> str:
-        head = call(self, Shown(self.answer or "no margin asked for"), d_a=self.d_a, d_b=self.d_b, bound=self.d_b_bound)
-        return lines(head, self.statement, f"counterexamples: {len(self.counterexamples)} of {self.executions}")
+        return call(self, self.answer, d_a=self.d_a, d_b=self.d_b, bound=self.d_b_bound, executions=self.executions)
 
 
 def judged_by(experiment: Experiment, distance: UnsafeMargin) -> Experiment:
