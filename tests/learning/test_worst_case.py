@@ -88,7 +88,7 @@ def learned() -> DynamicsPosterior:
 
 def remembering() -> Remembering:
     known = learned()
-    return Remembering(**{one.name: getattr(known, one.name) for one in fields(known)})
+    return Remembering(**{one.name: getattr(known, one.name) for one in fields(known) if one.init})
 
 
 def maxima(search: WorstCaseSearch, posterior: DynamicsPosterior, known: Array, rng: np.random.Generator) -> WorstCase:

@@ -139,6 +139,19 @@ class LoopPlanner:
         advance(len(draws) * sum(len(plan.rows) for plan in planned), units=_UNITS)
         return distances
 
+    def distance_of(self, point: Array, trajectory: Trajectory) -> float:
+        """Return the distance of an execution of a task ``(d,)``; 0 if it is not known."""
+        for plan in self.plan(point[None]):
+            model = plan.nominal
+            if model.states.size == trajectory.states.size:
+                shapes = model.states.shape, model.inputs.shape
+                states, inputs = (
+                    x.reshape(s) for x, s in zip((trajectory.states, trajectory.inputs), shapes, strict=True)
+                )
+                distance = self.compared(plan, Trajectory(model.times, states, inputs))
+                return float(np.nan_to_num(distance, posinf=0.0)[0])
+        return 0.0
+
     def own_distances(self, draws: Draws, points: Array) -> Array:
         """Return the distances ``(S, q)`` of each draw on tasks of its own, at points ``(S, q, d)``."""
         (S, q, d), R = points.shape, draws.replicates

@@ -14,7 +14,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval.core.model import Model
-from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.core.trajectory import Transitions
 from ctxval.learning.closed_loops import Loops
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, LearnedCovariances, PosteriorSettings
 from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior
@@ -91,25 +91,12 @@ class AgreeingDynamics(LearnedDynamics):
         Errors that follow the motion add up to more than constant ones do, which the executed distances show.
         """
         (_, distances), settings = self._under_errors, self.study.settings.agreement
-        executed = np.array([self._distance_of(*each) for each in self.executions])
+        executed = np.array([self.study.planner.distance_of(*each) for each in self.executions])
         expected = distances[: len(executed)]
         ratios = np.divide(executed, expected, out=np.zeros(len(executed)), where=expected > 0)
         return float(distances.max()) * float(
             np.clip(settings.margin * ratios.max(initial=0.0), 1.0, settings.amplified)
         )
-
-    def _distance_of(self, point: Array, trajectory: Trajectory) -> float:
-        """Return the distance of an execution; 0 if it is not known."""
-        for plan in self.study.planner.plan(point[None]):
-            model = plan.nominal
-            if model.states.size == trajectory.states.size:
-                shapes = model.states.shape, model.inputs.shape
-                states, inputs = (
-                    x.reshape(s) for x, s in zip((trajectory.states, trajectory.inputs), shapes, strict=True)
-                )
-                distance = self.study.planner.compared(plan, Trajectory(model.times, states, inputs))
-                return float(np.nan_to_num(distance, posinf=0.0)[0])
-        return 0.0
 
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance under negligible errors, for each of so many draws."""
