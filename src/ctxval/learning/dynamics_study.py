@@ -29,6 +29,7 @@ from ctxval.learning.dynamics_posterior import (
     learn_covariances,
 )
 from ctxval.learning.effects.inputs import InputEffects
+from ctxval.learning.effects.mujoco import further_attributes
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.input_effects import Found, input_candidates
 from ctxval.learning.learned_dynamics import LearnedDynamics
@@ -231,7 +232,7 @@ class DynamicsStudy(ShortRepr):
         key = digest(loops[:count])
         posterior, seed = None, (self.seed, count, 0)
         if key not in self._effects_of:
-            candidates = self.input_candidates(loops, together=True)
+            candidates = self.input_candidates(loops, together=True) + further_attributes(model, loops)
             posterior = learned_parameters(model, loops[:count], on_model, seed, candidates, None, settings.parametric)
             self._effects_of[key] = () if posterior is None else posterior.effects
         if posterior is None or count < len(loops):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -11,9 +11,11 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.core.model import Model
+from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError
 from ctxval.learning.effects.effect import Effect, EffectCandidate, Observed, Parameter, of_ratio, of_size
-from ctxval.learning.effects.plant import Joint, Plant
+from ctxval.learning.effects.plant import Joint, Plant, plant_of
+from ctxval.models import MuJoCo
 from ctxval.models.mujoco_parameters import drawn_fields, uncertain_parameters
 
 
@@ -103,7 +105,7 @@ class SharedAttribute(OfMuJoCo):
             with suppress(InputError):  # its values are 0
                 uncertain_parameters(compiled, {name: "10 %"})
                 if not name.startswith(("mass", "centre")):
-                    yield of_ratio(cls((1.0,), name))
+                    yield of_size(cls((1.0,), name), Parameter(name, 0.1, 10.0, 0.1), 0.95, 1.1)
         inertias = _inertias(compiled)
         forces = [
             float(inertias[joint.dof] * observed.missed[joint.rate] / plant.dt)
@@ -112,17 +114,27 @@ class SharedAttribute(OfMuJoCo):
         ]
         if len(forces) > 1 and max(forces) > 0:
             size = float(np.median(forces))
-            parameter = Parameter("friction loss", 0.0, 20 * max(forces), 0.05 * max(size, 1e-9))
+            parameter = Parameter("frictionloss", 0.0, 20 * max(forces), 0.05 * max(size, 1e-9))
             yield of_size(cls((0.0,), "frictionloss", True), parameter, 0.3 * size, size)
         most = float(np.linalg.norm(compiled.opt.gravity))
         for axis in "xy" if touches and most > 0 else "":
-            tilt = Parameter("gravity", -0.5 * most, 0.5 * most, 0.01 * most, "m/s^2")
+            tilt = Parameter(f"gravity_{axis}", -0.5 * most, 0.5 * most, 0.01 * most, "m/s^2")
             yield of_size(cls((0.0,), f"gravity_{axis}", True), tilt, 0.0)
 
+    @property
+    def unit(self) -> float | str:
+        """The deviation of the uncertain parameter that it is."""
+        return 1.0 if self.added else "100 %"
+
+    @property
+    def standardised(self) -> Array:
+        """The values of this parameter for its sizes, those of draws or one ``(S, 1)``."""
+        sizes = np.reshape(self.sizes[0], (-1, 1))
+        return sizes if self.added else np.log(sizes)
+
     def change(self, compiled: Any) -> None:
-        parameters = uncertain_parameters(compiled, {self.parameter: 1.0 if self.added else "100 %"})
-        z = np.array([[self.sizes[0] if self.added else np.log(self.sizes[0])]])
-        for field, values in drawn_fields(compiled, parameters, z).items():
+        parameters = uncertain_parameters(compiled, {self.parameter: self.unit})
+        for field, values in drawn_fields(compiled, parameters, self.standardised).items():
             target = compiled.opt.gravity if field == "opt.gravity" else getattr(compiled, field)
             target[:] = values[0]
 
@@ -134,6 +146,22 @@ class SharedAttribute(OfMuJoCo):
         if self.added:
             return f"all driven joints stick ({size:.3g} N m)"
         return f"{self.parameter} is {size:.3g} times that of M"
+
+
+def further_attributes(model: Model, runs: Sequence[Trajectory]) -> tuple[EffectCandidate, ...]:
+    """Return the attributes in which executions may differ from a model beside its uncertain parameters."""
+    if not isinstance(model, MuJoCo):
+        return ()
+    x, x_next = (np.concatenate([run.states[rows] for run in runs]) for rows in (slice(-1), slice(1, None)))
+    u = np.concatenate([run.inputs for run in runs])
+    states, inputs = ({f"{name}{k}": "" for k in range(part.shape[1])} for name, part in (("x", x), ("u", u)))
+    with np.errstate(all="ignore"):
+        missed = model.geometry.difference(model.step(x, u), x_next)
+    usable = np.isfinite(missed).all(axis=1)
+    plant, sizes = plant_of(model, model.dt, states, inputs, x, u), np.sqrt((missed[usable] ** 2).mean(axis=0))
+    named = {each.name.partition("[")[0] for each in model.uncertain}
+    shared = SharedAttribute.candidates(Observed(plant, x, u, sizes, 0.0, estimated=False))
+    return tuple(each for each in shared if each.parameters[0].name.partition("[")[0] not in named)
 
 
 @dataclass(frozen=True)
