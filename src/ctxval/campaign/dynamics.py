@@ -127,6 +127,8 @@ class CampaignDynamics:
 
     def has_no_time(self, trials: Sequence[Trial]) -> bool:
         """Return whether the budget of the choice after trials allows no closed loops; nothing is learned."""
+        if self.thinking.after(trials) is None:  # then no trajectory is read
+            return False
         return self.thinking.ledger(trials, len(executed_trials(self._store, trials))).spent_up
 
     def affords(self, trials: Sequence[Trial], loops: int) -> bool:
