@@ -127,6 +127,8 @@ class CampaignDynamics:
 
     def has_no_time(self, trials: Sequence[Trial]) -> bool:
         """Return whether the budget of the choice after trials allows no closed loops; nothing is learned."""
+        if self.thinking.after(trials) is None:  # then no trajectory is read
+            return False
         return self.thinking.ledger(trials, len(executed_trials(self._store, trials))).spent_up
 
     def affords(self, trials: Sequence[Trial], loops: int) -> bool:
@@ -285,7 +287,7 @@ class CampaignDynamics:
             [self._allowed(trials), *((trial.number, trial.state, trial.distance, trial.note) for trial in trials)]
         )
         physical = "".join(f"{name} " for name in self.study.given.physical)
-        return f"evidence {confidence} {self.study.target.key} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
+        return f"evidence {confidence} {self.study.target} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
     def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float, ledger: Ledger) -> Evidence:
         draws, drawn_from = draws_for(confidence), learned.drawn_from
