@@ -57,7 +57,7 @@ lowest: .venv/lowest/.installed  ## the page's security, with the lowest version
 	  -k "test_security or three_hundred or send_much or nonsense or (refused and not wrong_file)"
 
 bench: .venv/.test  ## speed, as ratios measured in one run
-	for script in benchmarks/bench_*.py; do $(BIN)/python $$script || exit 1; done
+	failed=0; for script in benchmarks/bench_*.py; do $(BIN)/python $$script || failed=1; done; exit $$failed
 
 bench-peers: .venv/peers/.installed .venv/peers-verifai/.installed  ## beside others; writes docs/benchmarks.md, and resumes
 	cd benchmarks && for group in peers peers-verifai; do for part in run overhead; do \

@@ -185,3 +185,18 @@ def test_a_failed_task_of_a_suite_is_not_trusted() -> None:
     campaign.add({"task": name}, failed="it fell")
     envelope = campaign.envelope(100.0)
     assert set(envelope.tasks or ()) == set(COARSE.task_names) - {name}
+
+
+def test_a_law_of_the_distances_bounds_a_suite_whose_dynamics_take_too_long_to_learn() -> None:
+    goals = TaskSuite({f"go to {goal:g}": {"goal": float(goal)} for goal in np.geomspace(0.5, 2, 41)})
+    given = validation(goals, lambda p: p.goal)
+    largest = true_distances(given).max()
+    campaign = Campaign(given, seed=0).run(41, 1.25 * largest, thinking=1e-4)
+    verdict = campaign.verdict(1.25 * largest, thinking=1e-4)
+    assert verdict.answer == "validated"
+    assert 18 <= campaign.executions <= 30
+    assert largest <= (verdict.bound or 0.0) <= 1.25 * largest
+    certificate = verdict.certificate
+    assert certificate is not None
+    assert (certificate.kind, certificate.details["not_executed"]) == ("suite", 41 - campaign.executions)
+    assert campaign.verdict(0.9 * campaign.trials.largest, thinking=1e-4).answer == "falsified"

@@ -119,3 +119,9 @@ def validation_settings():  # type: ignore[no-untyped-def]
 def test_other_budgets_are_refused(seconds: Any) -> None:
     with pytest.raises(InputError, match="thinking"):
         Campaign(make_validation(), seed=0).run(2, 0.5, thinking=seconds)
+
+
+def test_without_a_budget_whether_there_is_time_is_known_without_trajectories(monkeypatch: pytest.MonkeyPatch) -> None:
+    campaign = Campaign(make_validation(), seed=0).run(2)
+    monkeypatch.setattr("ctxval.campaign.dynamics.executed_trials", None)
+    assert not campaign.recorder.dynamics.has_no_time(campaign.trials)

@@ -20,7 +20,6 @@ def test_options_ask_for_the_largest_distance_or_for_that_of_a_share_until_noise
     assert Target.asked(0.8, 0.95) == Share(0.95, 0.8)
     assert Largest(0.8).with_noise() == Quantile(0.8)
     assert Share(0.95, 0.8).with_noise() == Quantile(0.8, 0.95)
-    assert Largest(0.8).key != Share(0.95, 0.8).key
 
 
 def test_an_execution_contradicts_a_bound_on_the_largest_distance_alone() -> None:

@@ -15,7 +15,7 @@ from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.errors import DesignError
 from ctxval.learning import PosteriorSettings
-from ctxval.learning.recorded import closed_loops_on_model, data_near, recorded_transitions
+from ctxval.learning.recorded import Memories, closed_loops_on_model, data_near, recorded_transitions
 
 A, B = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]]
 LQR = controllers.LQR([1.0, 0.1], [0.1])
@@ -212,3 +212,34 @@ def test_of_very_many_transitions_those_near_the_tasks_are_taken_in_little_memor
         return float(np.sqrt(((pairs[:, None] - known[::7]) ** 2).sum(axis=2)).min(axis=1).max())
 
     assert farthest(near) < farthest(of_few)
+
+
+class Accumulating:
+    """A model with memory that counts how often it is followed."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+
+    def step(self, x: Array, u: Array) -> Array:
+        return x + u
+
+    def start(self, x: Array) -> Array:
+        return np.zeros((*x.shape[:-1], 1))
+
+    def advance(self, x: Array, u: Array, memory: Array) -> tuple[Array, Array]:
+        self.steps += 1
+        return x + u + memory, memory + 1.0
+
+
+def test_a_model_is_followed_once_along_each_recording() -> None:
+    model, known = Accumulating(), Memories()
+    first, second = (Trajectory(np.arange(4.0), np.full((4, 1), k), np.zeros((3, 1))) for k in (0.0, 1.0))
+    for recorded in (first, second, first):
+        assert known.of(model, recorded).memory is not None
+    assert model.steps == 6
+    assert np.isnan(known.of(model, first, started=False).memory).any()  # type: ignore[arg-type]
+    assert model.steps == 9
+    np.testing.assert_array_equal(known.of(model, first).memory, [[0.0], [1.0], [2.0]])  # type: ignore[arg-type]
+    other = Accumulating()
+    known.of(other, first)
+    assert other.steps == 3

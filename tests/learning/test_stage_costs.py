@@ -47,6 +47,15 @@ def test_a_part_of_the_dynamics_that_is_left_out_is_said_and_keeps_the_reserve()
     assert book.to_json()["replaced"] == ["histories"]
 
 
+def test_parts_of_the_dynamics_leave_time_for_the_smallest_search_until_it_is_taken() -> None:
+    book = ledger(5.0)
+    book.reserve, book.owed = 1.0, 3.0
+    assert not book.learns("noise", "histories", lambda costs: 2.0)
+    assert not book.optional("learning", "a parameter", lambda costs: 2.0)
+    book.owed = 0.0
+    assert book.learns("noise", "histories", lambda costs: 2.0)
+
+
 def test_stages_without_which_a_verdict_stands_are_optional() -> None:
     book = ledger(1.0)
     assert not book.optional("loops", "pushes", lambda costs: 2.0)

@@ -599,10 +599,13 @@ class Campaign:
         recorder.dynamics.shortage = None
         with stage("certifying"), recorder.dynamics.thinking.limited(thinking):
             known, shortage = self.provenance_for(options, threshold), recorder.dynamics.shortage
-            if shortage is None:
+            verdict = None
+            if shortage is None or recorder.validation.space.members is not None:
                 verdict = judge(recorder.trials, threshold, options, known)
-            else:  # another bound has not seen what this evidence might show, such as noise
+            # In a box, another bound has not seen what this evidence might show, such as noise.
+            if shortage is not None and (verdict is None or verdict.answer == "undecided"):
                 verdict = Verdict("undecided", threshold, f"{shortage}.", shortage=shortage.to_json())
+            assert verdict is not None
             return with_next_task(verdict, recorder, options), known
 
     @checked

@@ -21,14 +21,15 @@ from ctxval.campaign.storage.store import Store
 from ctxval.campaign.thinking import THINKING, CampaignThinking, TimeShortage
 from ctxval.certificates.checks import is_open
 from ctxval.certificates.dynamics import draws_for
-from ctxval.certificates.evidence import Evidence, Learned
+from ctxval.certificates.evidence import Evidence, Learned, SuiteRuns
 from ctxval.certificates.explained import ExplainedExecution
 from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.predictions import CheckedPrediction
 from ctxval.certificates.sample import Sample
 from ctxval.core.target import Target
-from ctxval.core.trajectory import Trajectory
+from ctxval.core.task_suite import TaskSuite
+from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.trial import REDEFINED, Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError
@@ -85,6 +86,7 @@ class CampaignDynamics:
 
     def _use(self, study: DynamicsStudy) -> None:
         self.study, self._learned = study, _Known(LIMITS.predictions + 3)
+        self._of_suite: Array | None = None  # the ends of the run of M on each task of a suite, (N, 2, n + m)
         self._parts: tuple[str, bytes] | None = None  # of the study, when it learned first
         # Predictions that no store has, by their trials: each verdict checks those of the last trials.
         self._afterwards: Latest[Any, ExecutionPrediction | None] = Latest(2 * LIMITS.predictions)
@@ -125,6 +127,8 @@ class CampaignDynamics:
 
     def has_no_time(self, trials: Sequence[Trial]) -> bool:
         """Return whether the budget of the choice after trials allows no closed loops; nothing is learned."""
+        if self.thinking.after(trials) is None:  # then no trajectory is read
+            return False
         return self.thinking.ledger(trials, len(executed_trials(self._store, trials))).spent_up
 
     def affords(self, trials: Sequence[Trial], loops: int) -> bool:
@@ -283,7 +287,7 @@ class CampaignDynamics:
             [self._allowed(trials), *((trial.number, trial.state, trial.distance, trial.note) for trial in trials)]
         )
         physical = "".join(f"{name} " for name in self.study.given.physical)
-        return f"evidence {confidence} {self.study.target.key} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
+        return f"evidence {confidence} {self.study.target} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
     def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float, ledger: Ledger) -> Evidence:
         draws, drawn_from = draws_for(confidence), learned.drawn_from
@@ -443,11 +447,45 @@ class CampaignDynamics:
             if kind.needs_evidence(sample):
                 self.ask_of(kind.target)
                 evidence = self.evidence(trials, options.confidence)
-                return Learned(evidence, None if evidence is not None else self.failure)
+                if evidence is not None:
+                    return Learned(evidence)
+                return Learned(None, self.failure, self.runs_of_suite(trials))
         return Learned()
+
+    def runs_of_suite(self, trials: Sequence[Trial]) -> SuiteRuns | None:
+        """Return how far runs of M on the tasks of a suite leave the records, with the features of its tasks.
+
+        Returns None if tasks fill a box, if a parameter is a category, or if S records outputs.
+        """
+        space = self.study.given.space
+        features = space.features if isinstance(space, TaskSuite) else None
+        if features is None or self.study.given.outputs.hide_states:
+            return None
+        records = [_ends(run.states, run.inputs) for _, run in executed_trials(self._store, trials)]
+        data = getattr(self.study.given.model, "data", None)
+        records += [_ends(data.x, data.u)] if isinstance(data, Transitions) else []
+        if not records:
+            return None
+        if self._of_suite is None:
+            of_suite = np.full((len(features), *records[0].shape), np.nan)
+            with stage("planning the suite", len(features), "tasks"):
+                for row, member in enumerate(np.asarray(space.members)):
+                    for planned in self.study.planner.plan(member[None]):
+                        of_suite[row] = _ends(planned.nominal.states, planned.nominal.inputs)
+            self._of_suite = of_suite
+        low, high = np.min(records, axis=0)[0], np.max(records, axis=0)[1]
+        lows, highs = np.moveaxis(self._of_suite, 1, 0)
+        beyond = np.maximum(np.maximum(low - lows, highs - high), 0.0) / np.maximum(high - low, 1e-9)
+        return SuiteRuns(features, np.where(np.isfinite(beyond), beyond, np.inf).max(axis=1))
 
     def stored_prediction(self, trial: Trial) -> ExecutionPrediction | None:
         """Return the prediction that was stored before an execution, if it is one of the present distance."""
         note = (trial.note or {}).get(PREDICTION)
         present = isinstance(note, dict) and note.get("experiment") == self.experiment
         return prediction_in(trial.note) if present else None
+
+
+def _ends(states: Array, inputs: Array) -> Array:
+    """Return the smallest and the largest of states ``(..., n)`` and inputs ``(..., m)``, ``(2, n + m)``."""
+    both = [part.reshape(-1, part.shape[-1]) for part in (states, inputs)]
+    return np.array([np.concatenate([end(part, axis=0) for part in both]) for end in (np.min, np.max)])

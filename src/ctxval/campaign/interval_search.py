@@ -20,7 +20,7 @@ from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.next_task import CandidateFilter, next_task
 from ctxval.campaign.proposals import DesignContinuity, spread_tests
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.certificates import CertificateOptions, Evidence, Sample, StoppingRule, Verdict
+from ctxval.certificates import CertificateOptions, Evidence, Learned, Sample, StoppingRule, Verdict
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic, WholeSuite
 from ctxval.certificates.bets import bets_against
@@ -33,6 +33,7 @@ from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import DistanceBound
 from ctxval.certificates.prediction_tests import DRAWN, HYPERCUBE, MANY, TESTS, hypercube_in
 from ctxval.certificates.predictions import missing_tests, mostly_fail
+from ctxval.certificates.remaining import RemainingTasks
 from ctxval.certificates.task_share import PREDICTED_ABOVE, bet_on
 from ctxval.certificates.verdict import counterexample, require_possible
 from ctxval.core.target import Target
@@ -229,6 +230,8 @@ class IntervalSearch:
     def _by_distance(self) -> Choice | None:
         """Return the task that the posterior bound of the distance needs; None if it decides."""
         kind = self.options.kind.without_dynamics(self._target, self._suite)
+        if isinstance(kind, WholeSuite) and isinstance(self.options.kind, Automatic):
+            return self._by_law(kind)
         # It does not bound a share of the tasks, no distance is known, all are 0, or each task of a suite is executed.
         if not isinstance(kind, DistanceBound) or not self.limit > 0:
             return self.test() if self._target.by_draws and self.recorder.trials else Choice(planned_draws=0)
@@ -240,6 +243,24 @@ class IntervalSearch:
             return Choice(now.next_point, "covering", planned_draws=0, rejected=rejected)
         asked, sample = self.options.kind, Sample.of(self.recorder.trials.ended)
         return self.test() if isinstance(asked, Automatic) and asked.missing_tests(sample) else None
+
+    def _by_law(self, kind: WholeSuite) -> Choice | None:
+        """Return the task that a law of the distances of a suite needs; None if it decides, or learned dynamics may."""
+        recorder, trials = self.recorder, self.recorder.trials
+        searched = Choice(planned_draws=0)
+        if trials.in_state("failed") or len(trials.ended) <= LIMITS.freedom or not self.limit > 0:
+            return searched
+        learned = Learned(suite=recorder.dynamics.runs_of_suite(trials))
+        suite, repeats = self._suite, recorder.validation.space.repeats
+        sample = replace(Sample.of(trials.ended), suite=suite, repeats=repeats, learned=learned)
+        left = RemainingTasks(sample, kind.tests)
+        if not left.can_be_bounded or suite is None:
+            return searched
+        if kind.certify(sample, self.options.confidence).covers(self.limit):
+            decides = recorder.dynamics.evidence(trials, self.options.confidence, keep=self.keeps) is None
+            return None if decides else searched
+        row = left.next_row(self.limit)
+        return Choice.tested(recorder.draws.left(trials), "spread") if row is None else Choice.tested(suite[row])
 
     def _by_dynamics(self, evidence: Evidence) -> Choice | None:
         """Return the task that the learned dynamics need, or that the posterior bound needs; None if one decides."""
@@ -254,7 +275,7 @@ class IntervalSearch:
         if decides:
             whole = dynamics.evidence(trials, confidence, keep=self.keeps)
             if whole is None:  # more executions do not help if time is short
-                return None if dynamics.shortage is not None else self._by_distance()
+                return None if dynamics.shortage is not None and self._suite is None else self._by_distance()
             evidence = self._asked(whole)
             with suppress(CertificateError):
                 sample = replace(Sample.of(trials.ended), threshold=self.limit)

@@ -125,8 +125,8 @@ class CampaignThinking:
         ledger, few = Ledger(Costs(thinking, sizes)), thinking.settings.few_draws
         ledger.reserve = ledger.seconds("loops", lambda costs: costs.prediction(few) + costs.next_task())
         learning = ledger.seconds("learning", lambda costs: costs.learning())
-        loops = ledger.seconds("loops", lambda costs: costs.search(smallest, whole=False) + costs.plan(4))
-        if ledger.reserve + loops + learning > thinking.seconds:
+        ledger.owed = ledger.seconds("loops", lambda costs: costs.search(smallest, whole=False) + costs.plan(4))
+        if ledger.reserve + ledger.owed + learning > thinking.seconds:
             ledger.spent_up = True
             ledger.incomplete = learning + ledger.seconds("loops", lambda costs: costs.search(settings))
             ledger.replaced.append("learned dynamics, by the distances alone")

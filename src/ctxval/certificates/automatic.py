@@ -21,8 +21,14 @@ from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.posterior import DistanceBound
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
 from ctxval.certificates.predictions import mostly_fail
+from ctxval.certificates.remaining import RemainingTasks
 from ctxval.certificates.sample import SAME, Sample
-from ctxval.certificates.sentences.statements import EXECUTED_AGAIN, INDEPENDENT_REPEATS
+from ctxval.certificates.sentences.statements import (
+    EXECUTED_AGAIN,
+    INDEPENDENT_REPEATS,
+    LAW_OF_DISTANCES,
+    suite_statement,
+)
 from ctxval.certificates.sentences.verdicts import supported as supported_by
 from ctxval.certificates.task_share import Share
 from ctxval.core.quantiles import QUANTILE
@@ -35,19 +41,25 @@ from ctxval.errors import CertificateError
 class WholeSuite(CertificateKind):
     """The largest distance of a suite of tasks, all of which were executed.
 
-    If tasks are repeated, it is a bound on a quantile of the executions of each task, without any law of the noise.
+    If tasks are repeated, it is a bound on a quantile of the executions of each task, without any law of the noise. For
+    ``auto``, it is also a bound by a law of the distances if no dynamics can be learned and tasks are left
+    (:mod:`~ctxval.certificates.remaining`).
     """
 
     name: ClassVar[str] = "suite"
     takes_suites: ClassVar[bool] = True
 
     quantile: Probability = QUANTILE  #: the share of the executions of each task that a bound with repeats is about
+    tests: NonNegativeInt = TESTS  #: executions of drawn tasks that a law of the distances needs
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the certificate; the largest executed distance is the largest of all."""
         missing = sample.not_executed
         if missing is None:
             raise CertificateError("tasks fill a box here, so they cannot all be executed; this kind is for a suite.")
+        left = RemainingTasks(sample, self.tests)
+        if missing and left.can_be_bounded:
+            return self._of_remaining(left, confidence)
         if missing:
             raise CertificateError(
                 f"{missing} of {counted(sample.tasks or 0, 'task')} of the suite have no distance yet, so the largest "
@@ -59,6 +71,29 @@ class WholeSuite(CertificateKind):
         statement = f"All {sample.tasks} tasks of the suite were executed, and their largest distance is {h:.6g}."
         details = {"best": h, "tasks": sample.tasks, "failures": sample.failures}
         return Certificate(self.name, statement, h, confidence, 0.0, len(sample), assumptions, details)
+
+    def _of_remaining(self, left: RemainingTasks, confidence: float) -> Certificate:
+        """Return the bound by the law of the distances, or the largest executed distance if that is more."""
+        sample, withdrawal = left.sample, left.withdrawal()
+        h, missing = max(sample.best, left.law.bound(confidence)), len(left.rows)
+        details = {
+            "best": sample.best,
+            "tasks": sample.tasks,
+            "not_executed": missing,
+            "freedom": left.law.freedom,
+            "beyond_the_records": float(left.beyond.max()),
+            "evidence_against": left.against,
+            "tests": {"drawn": len(left.drawn), "share_missed": None, "largest_error": None},
+        }
+        return self.certificate(
+            sample,
+            suite_statement(h, confidence, sample.tasks or 0, missing),
+            h,
+            confidence,
+            (LAW_OF_DISTANCES, EXECUTED_AGAIN),
+            details,
+            **({} if withdrawal is None else dict(zip(("withdrawn_by", "doubt"), withdrawal, strict=True))),
+        )
 
     def _of_repeats(self, sample: Sample, confidence: float) -> Certificate:
         """Return the bound by order statistics: how many of n executions lie below a quantile is binomial."""
@@ -117,7 +152,7 @@ class Automatic(CertificateKind):
             case Largest() if suite is None:
                 return DistanceBound(self.resolution)
             case Largest():
-                return WholeSuite(self.quantile)
+                return WholeSuite(self.quantile, self.tests)
         return Dynamics(self.tests, self.quantile, self.share)
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:

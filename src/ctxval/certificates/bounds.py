@@ -148,7 +148,7 @@ class Quantities:
     def lengths(self, share: float) -> str:
         """Return a share of each range in the units of the task parameters, if they are few and known."""
         space = self.space
-        if space is None or space.members is not None or space.dimension > _NAMED:
+        if space is None or space.dimension > _NAMED:  # of a suite, no gaps are bounded
             return f"{share:.2g} of each parameter's range"
         widths = zip(space.labels, (space.high - space.low).tolist(), strict=True)
         lengths = {label: f"{share * width:.2g} {parted(label)[1]}".rstrip() for label, width in widths}

@@ -230,8 +230,17 @@ class Evidence(ShortRepr):
 
 
 @dataclass(frozen=True, eq=False)
+class SuiteRuns(ShortRepr):
+    """The tasks of a suite as a law of the distances sees them."""
+
+    features: Array  #: of each task, such as the logarithms of its parameters ``(N, k)``
+    beyond: Array  #: how far the run of M leaves the records, as a share of the recorded range ``(N,)``
+
+
+@dataclass(frozen=True, eq=False)
 class Learned(ShortRepr):
     """What the experiment's model and the executions predict, for kinds of certificates that need more than trials."""
 
     evidence: Evidence | None = None  #: evidence on d*; None if nothing can be learned, or if the kind needs none
     failure: str | None = None  #: why nothing could be learned; None if that is not known
+    suite: SuiteRuns | None = None  #: without evidence, runs of M on the tasks of a suite; None if parameters are names

@@ -59,6 +59,9 @@ class CheckLimits:
     uneven: float = 1.5  #: ratio of a force that a joint at rest withstood to one that moved it elsewhere
     supported: float = 1.0  #: least likelihood ratio of the noise against a share of executions above the threshold
 
+    # The law of the distances of a suite
+    freedom: int = 8  #: executions beyond the number of its coefficients: with fewer, its tails are too long to bound
+
     # Remedies
     near: float = 0.7  #: share of the way from the largest distance to the threshold from which a draw is near it
     repetitions: int = 0  #: executions of a task that are chosen because one execution does not explain it

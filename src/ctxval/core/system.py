@@ -122,23 +122,18 @@ class AllStates(Outputs):
         super().__init__(np.asarray)
 
     def __call__(self, x: Array) -> Array:
-        """Return states as they are."""
         return x
 
     def of(self, trajectory: Trajectory) -> Trajectory:
-        """Return a trajectory as it is."""
         return trajectory
 
     def seen_by(self, controller: Controller, task: Task | None = None) -> Controller:
-        """Return a controller as it is."""
         return controller
 
     def recording(self, system: System) -> System:
-        """Return a system as it is."""
         return system
 
     def geometry(self, model: Model) -> StateGeometry:
-        """Return the geometry of a model's states."""
         return geometry_of(model)
 
 

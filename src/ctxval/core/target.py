@@ -20,17 +20,10 @@ from ctxval.core.quantiles import QUANTILE
 class Target(ABC):
     """What a threshold is about."""
 
-    quantile: float
-    """The share of the executions of each task that it is about if they differ by noise."""
-
-    share: float
-    """The share of the tasks that it is about."""
-
-    is_noisy: ClassVar[bool] = False
-    """Whether executions of one task differ by noise, so that one above the threshold falsifies nothing."""
-
-    by_draws: ClassVar[bool] = False
-    """Whether independent draws of tasks decide it, so that its tests are such draws."""
+    quantile: float  #: the share of the executions of each task that it is about if they differ by noise
+    share: float  #: the share of the tasks that it is about
+    is_noisy: ClassVar[bool] = False  #: whether executions of one task differ, so that one alone falsifies nothing
+    by_draws: ClassVar[bool] = False  #: whether independent draws of tasks decide it, so that its tests are such draws
 
     @classmethod
     def asked(cls, quantile: float, share: float) -> Target:
@@ -52,11 +45,6 @@ class Target(ABC):
     def volume(self) -> float:
         """The share of the tasks that it leaves out."""
         return round(1 - self.share, 12)
-
-    @property
-    def key(self) -> str:
-        """A text that differs between targets, for what is kept by it."""
-        return f"{self.quantile}"
 
     def with_noise(self) -> Target:
         """Return the target if executions of one task differ by noise."""
@@ -122,10 +110,6 @@ class Share(Target):
 
     share: float
     quantile: float = QUANTILE
-
-    @property
-    def key(self) -> str:
-        return f"{self.quantile} share {self.share}"
 
     def reached(self, best: float, predicted: Callable[[], float]) -> float:
         return predicted()

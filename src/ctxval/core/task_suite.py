@@ -95,6 +95,14 @@ class TaskSuite(TaskSpace):
             raise UnknownNameError.among("task", str(name), self.task_names)
         return dict(self._tasks[name])
 
+    @property
+    def features(self) -> Array | None:
+        """The logarithms of positive parameters and the other ones as they are ``(N, d)``; None with a category."""
+        if self._categories:
+            return None
+        positive = (self._rows > 0).all(axis=0)
+        return np.where(positive, np.log(np.where(positive, self._rows, 1.0)), self._rows)
+
     def __len__(self) -> int:
         return len(self.task_names)
 

@@ -209,6 +209,6 @@ def bounded(z: Array) -> Array:
     """Return standardised pairs within limits, in the same array: a loop that diverges stays finite; NaN becomes 0."""
     np.maximum(z, -1e6, out=z)
     np.minimum(z, 1e6, out=z)
-    if math.isnan(z.sum()):
+    if math.isnan(np.vdot(z, z)):
         z[np.isnan(z)] = 0.0
     return z

@@ -29,6 +29,7 @@ from ctxval.learning.dynamics_posterior import (
     learn_covariances,
 )
 from ctxval.learning.effects.inputs import InputEffects
+from ctxval.learning.effects.mujoco import further_attributes
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.input_effects import Found, input_candidates
 from ctxval.learning.learned_dynamics import LearnedDynamics
@@ -37,7 +38,7 @@ from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.parametric_dynamics import ParametricDynamics, ParametricSettings, learned_parameters
 from ctxval.learning.precision import AgreeingDynamics, AgreementSettings, agreeing_posterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
-from ctxval.learning.recorded import data_near, digest, recorded_transitions, scheduled
+from ctxval.learning.recorded import Memories, data_near, digest, recorded_transitions, scheduled
 from ctxval.learning.regular import RegularSettings, split_transitions
 from ctxval.learning.share_search import ShareSearch
 from ctxval.learning.stage_costs import Costs, Ledger, ThinkingSettings, reduced
@@ -87,8 +88,9 @@ class DynamicsStudy(ShortRepr):
         effects: Found = (),
         friction: DryFriction | None = None,
         with_data: bool = True,
+        memories: Memories | None = None,
     ) -> None:
-        self.settings = settings or LearningSettings()
+        self.settings, self.memories = settings or LearningSettings(), memories or Memories()
         self.given, self.seed, self.target = validation, seed, target
         self.effects, self.friction, self.with_data = effects, friction, with_data
         of_inputs = InputEffects(tuple(each.effect for each in effects))
@@ -127,7 +129,7 @@ class DynamicsStudy(ShortRepr):
             extended = same if effects is None else None
             self._made[key] = DynamicsStudy(
                 given, self.seed, self.target, extended, self.settings,
-                effects=kept, friction=friction, with_data=with_data,
+                effects=kept, friction=friction, with_data=with_data, memories=self.memories,
             )  # fmt: skip
         return self._made[key]
 
@@ -158,7 +160,7 @@ class DynamicsStudy(ShortRepr):
         """Return the search, of fewer tasks if the budget of a ledger does not allow all of them."""
         if not ledger.is_limited or not self.search.settings.reducible:
             return self.search
-        shares = self.settings.thinking.shares
+        shares, ledger.owed = self.settings.thinking.shares, 0.0
         for share in shares:
             settings = reduced(self.search.settings, share) if share < 1 else self.search.settings
 
@@ -230,7 +232,7 @@ class DynamicsStudy(ShortRepr):
         key = digest(loops[:count])
         posterior, seed = None, (self.seed, count, 0)
         if key not in self._effects_of:
-            candidates = self.input_candidates(loops, together=True)
+            candidates = self.input_candidates(loops, together=True) + further_attributes(model, loops)
             posterior = learned_parameters(model, loops[:count], on_model, seed, candidates, None, settings.parametric)
             self._effects_of[key] = () if posterior is None else posterior.effects
         if posterior is None or count < len(loops):
@@ -402,7 +404,9 @@ class DynamicsStudy(ShortRepr):
         # The data that M was made from tell no earlier inputs.
         data = self._data if with_data and not self.effects else None
         loops = [loop for _, loop in executed]
-        return recorded_transitions(self.validation.model, data, loops, self.extended.loops, logged)
+        return recorded_transitions(
+            self.validation.model, data, loops, self.extended.loops, logged, memories=self.memories
+        )
 
     def input_candidates(self, loops: Sequence[Trajectory], *, together: bool) -> Found:
         """Return the effects that inputs may have in executions, alone or only those of all inputs ``together``."""

@@ -16,7 +16,7 @@ from ctxval._util.texts import parted
 from ctxval.core.coverage import StateInputCoverage, UnsampledParameter, UntestedRest, UnvisitedRegion
 from ctxval.core.labels import labels_of
 from ctxval.core.learned_numbers import PushedDistances
-from ctxval.core.model import Model, predicted_steps, with_memory
+from ctxval.core.model import Model, predicted_steps
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import AnyPosterior, Loops, distances_of, loop_pairs
 from ctxval.learning.coverage import (
@@ -181,8 +181,11 @@ class LearnedDynamics(ShortRepr):
         return self._errors_of([self.study.validation.model] * len(self.executed))
 
     def _errors_of(self, models: Sequence[Model]) -> Array:
-        loops = self.trajectories_of_system
-        steps = [predicted_steps(m, with_memory(m, loop)) for m, loop in zip(models, loops, strict=True)]
+        loops, steps = self.trajectories_of_system, []
+        for model, loop in zip(models, loops, strict=True):
+            # A mean has the memory of the model to which it adds residuals.
+            followed = model.model if isinstance(model, DynamicsDraws) else model
+            steps.append(predicted_steps(model, self.study.memories.of(followed, loop)))
         errors = [predicted - loop.states[1:] for predicted, loop in zip(steps, loops, strict=True)]
         return np.asarray(np.sqrt((np.concatenate(errors) ** 2).mean(axis=0)))
 

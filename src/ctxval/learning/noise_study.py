@@ -26,7 +26,7 @@ from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.innovations import FilterFit, InnovationsFit, LaggedFit, fit_filter, fit_lagged
 from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.recorded import digest, scheduled
-from ctxval.learning.stage_costs import Costs, Ledger
+from ctxval.learning.stage_costs import Costs, Ledger, reduced
 from ctxval.learning.worst_case import WorstCaseSearch
 
 
@@ -100,12 +100,12 @@ class NoiseStudy:
                 is_needed = predicted_by_history(posterior, records, self.extended.pairs, predicted, settings)
         if not is_needed:
             return None
-        structures = self._within(ledger)
+        replicates = settings.replicates if self.planner.batched else settings.replicates_alone
+        structures = self._within(ledger, replicates)
         if not structures:
             return None
         some = scheduled(len(records))
-        key = digest(records[:some]), structures
-        replicates, learned = settings.replicates if self.planner.batched else settings.replicates_alone, None
+        key, learned = (digest(records[:some]), structures), None
         if key not in self._structures:
             learned = self._learned(posterior, records[:some], replicates, structures)
             if learned is None:
@@ -125,8 +125,17 @@ class NoiseStudy:
         is_measured = not hidden and noisy.noise > settings.noisy and bool(scatters.any())
         return noisy if is_measured or self._effect(noisy) > settings.matters else replace(noisy, replicates=1)
 
-    def _within(self, ledger: Ledger) -> tuple[Structure, ...]:
-        """Return the structures that fit into the budget: all, those without measurement noise, or that of states."""
+    def _within(self, ledger: Ledger, replicates: int) -> tuple[Structure, ...]:
+        """Return the structures that fit into the budget: all, those without measurement noise, or that of states.
+
+        They leave time for the smallest search with sequences of noise, which takes longer than one without.
+        """
+
+        def smallest(costs: Costs) -> float:
+            few = reduced(self.search.settings, costs.thinking.settings.shares[-1])
+            return costs.search(few, replicates, whole=False)
+
+        ledger.owed = max(ledger.owed, ledger.seconds("loops", smallest))
         structures = self.settings.structures
         without_filters = tuple(each for each in structures if not each.ratio)
         for stage, some in (

@@ -47,6 +47,7 @@ class ParameterSettings:
     jitter: float = 0.2  # of draws around samples, in standard deviations
     effects: int = 2  # of inputs, such as a delay, at most
     explained: float = 0.05  # error of segments that is left, as a share of M's, below which no effects are looked for
+    starts: int = 3  # draws of the prior from which single steps are fitted if the parameters explain too little
     screened: int = 2  # Gauss-Newton steps with each of the effects that are tried
     price: float = 10.0  # by which an effect must raise the log posterior, beside the price of its size
 
@@ -196,12 +197,15 @@ class ParameterMode(ShortRepr):
         """Return the variance of errors that a Student likelihood has with its usual segments."""
         return max(float(np.median(of_segments)) / 0.8, self.settings.floor**2)
 
+    def height_at(self, z: Array, of_segments: Array) -> float:
+        """Return the log posterior of parameters ``(K,)`` with the variance that segments have there."""
+        variance = self.usual(of_segments)
+        return -float(self.surprise(of_segments, z, variance)) - 0.5 * len(of_segments) * float(np.log(variance))
+
     @property
     def height(self) -> float:
-        """The log posterior at the mode, with the variance that segments have there."""
-        return -float(self.surprise(self.here, self.z, self.variance)) - 0.5 * len(self.here) * float(
-            np.log(self.variance)
-        )
+        """The log posterior at the mode."""
+        return self.height_at(self.z, self.here)
 
     @property
     def left(self) -> float:
@@ -230,6 +234,29 @@ class ParameterMode(ShortRepr):
             covariance = (spread * weights[:, None]).T @ spread + 0.1 * covariance
         at_mean = replace(self, here=self.squares(mean[None])[0])
         return ParameterPosterior(self.model, mean, covariance, samples, weights, at_mean.left, settings)
+
+
+def most_probable_parameters(
+    model: UncertainModel, executed: Sequence[Trajectory], rng: np.random.Generator, settings: ParameterSettings
+) -> ParameterMode | None:
+    """Return the mode of segments of the usual length or of single steps, which explains more; None without segments.
+
+    Contacts begin and end with the parameters, so a fit of several steps, or one from the prior's mean alone, may end
+    in one of many local modes.
+    """
+    segments = Segments.of(model, executed, rng, settings)
+    if segments is None:
+        return None
+    mode = ParameterMode.of(model, segments, settings)
+    short = Segments.of(model, executed, rng, replace(settings, steps=1))
+    if mode.left <= settings.explained**2 or short is None:
+        return mode
+    of_steps = replace(mode, segments=short)
+    drawn = rng.standard_normal((settings.samples, len(mode.z)))
+    heights = [of_steps.height_at(z, here) for z, here in zip(drawn, of_steps.squares(drawn), strict=True)]
+    begun = [mode.z, *drawn[np.argsort(heights)[::-1][: settings.starts]]]
+    best = max((ParameterMode.of(model, short, settings, z) for z in begun), key=lambda each: each.height)
+    return best if best.left < mode.left else mode
 
 
 def most_probable_effects(
@@ -266,6 +293,35 @@ def most_probable_effects(
             break
         best, found = longer, (few.model.effects if isinstance(few.model, UncertainEffects) else found)
     return best
+
+
+def most_probable(
+    model: UncertainModel,
+    executed: Sequence[Trajectory],
+    candidates: Sequence[EffectCandidate],
+    known: Sequence[EffectCandidate] | None,
+    rng: np.random.Generator,
+    settings: ParameterSettings,
+) -> ParameterMode | None:
+    """Return the mode of parameters and effects; None without segments.
+
+    If it explains too little, what explains one execution alone is fitted to all: a mode of few contacts is found more
+    easily, and it ends at the mode of many.
+    """
+
+    def of(runs: Sequence[Trajectory]) -> ParameterMode | None:
+        found = most_probable_parameters(model, runs, rng, settings)
+        return None if found is None else most_probable_effects(found, candidates, known)
+
+    mode = of(executed)
+    for run in executed[: settings.starts] if mode is not None and len(executed) > 1 else ():
+        if mode is None or mode.left <= settings.explained**2:
+            break
+        alone = of([run])
+        if alone is not None and alone.left <= settings.explained**2:
+            fitted = ParameterMode.of(alone.model, mode.segments, settings, alone.z)
+            mode = fitted if fitted.height > mode.height else mode
+    return mode
 
 
 def blocks_of(lengths: Sequence[int], count: int, horizon: int, block: int, rng: np.random.Generator) -> Rows:

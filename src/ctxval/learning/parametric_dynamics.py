@@ -28,12 +28,10 @@ from ctxval.learning.execution_prediction import ExecutionPrediction, predict_ex
 from ctxval.learning.input_effects import Found
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.parameter_posterior import (
-    ParameterMode,
     ParameterPosterior,
     ParameterSettings,
-    Segments,
     blocks_of,
-    most_probable_effects,
+    most_probable,
 )
 from ctxval.learning.precision import agreeing_posterior
 from ctxval.learning.recorded import recorded_transitions
@@ -312,11 +310,10 @@ def learned_parameters(
     """
     rng = np.random.default_rng(seed)
     with single_threaded(), np.errstate(all="ignore"):
-        segments = Segments.of(model, executed, rng, settings.parameters)
-        if segments is None:
+        mode = most_probable(model, executed, candidates, known, rng, settings.parameters)
+        if mode is None:
             return None
-        mode = ParameterMode.of(model, segments, settings.parameters)
-        parameters = most_probable_effects(mode, candidates, known).posterior(rng)
+        parameters = mode.posterior(rng)
         fitted = _Single(parameters.model.drawn(parameters.mean[None]))
         recorded = recorded_transitions(fitted, None, executed, loops)
         plain = None if recorded is None else agreeing_posterior(fitted, *recorded, seed)

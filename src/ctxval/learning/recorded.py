@@ -9,7 +9,8 @@ import numpy as np
 import scipy
 
 from ctxval._util.arrays import Rows
-from ctxval.core.model import Model, with_memory
+from ctxval._util.latest import Latest
+from ctxval.core.model import Model, has_memory, with_memory
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
 from ctxval.learning.histories import Record
@@ -22,19 +23,36 @@ def data_near(model: Model, loops: Trajectory) -> Transitions | None:
     return data[_nearest(data, loops, 600)] if isinstance(data, Transitions) and len(data) else None
 
 
+class Memories:
+    """The transitions of recordings with the memory of models that follow them; simulators take long to follow."""
+
+    def __init__(self) -> None:
+        self._known = Latest[tuple[int, bytes, bool], tuple[Model, Transitions]](256)
+
+    def of(self, model: Model, recorded: Trajectory, *, started: bool = True) -> Transitions:
+        """Return what :func:`ctxval.core.model.with_memory` returns; the latest ones are kept."""
+        if not has_memory(model):
+            return recorded.transitions()
+        key = id(model), digest([recorded]), started
+        if key not in self._known:  # with the model, whose identity stays its own
+            self._known[key] = model, with_memory(model, recorded, started=started)
+        return self._known[key][1]
+
+
 def recorded_transitions(
     model: Model, data: Transitions | None, executed: Sequence[Trajectory], loops: Trajectory,
-    logged: Sequence[Trajectory] = (), most: int = 3000,
+    logged: Sequence[Trajectory] = (), most: int = 3000, memories: Memories | None = None,
 ) -> tuple[Transitions, Rows] | None:  # fmt: skip
     """Return the known transitions of the system and the execution of each; -1 for data that the model was made from.
 
     Returns None if there are none. Of more than ``most`` transitions, a random part is returned, and of recordings that
     belong to no task, those near closed loops on M; the numbers of these recordings follow those of the executions.
     """
-    parts = [with_memory(model, trajectory) for trajectory in executed]
+    memories = memories or Memories()
+    parts = [memories.of(model, trajectory) for trajectory in executed]
     sources = [np.full(len(part), k) for k, part in enumerate(parts)]
     if logged:
-        others = [with_memory(model, trajectory, started=False) for trajectory in logged]
+        others = [memories.of(model, trajectory, started=False) for trajectory in logged]
         of = np.repeat(len(executed) + np.arange(len(others)), [len(part) for part in others])
         together = Transitions.joined(others)
         rows = _nearest(together, loops, 1500, many=True)

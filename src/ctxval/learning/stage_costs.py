@@ -232,8 +232,8 @@ class Costs:
         return self._own(0.01 + 2 * pivots + 1e-8 * s.transitions * s.centres + 2e-10 * (s.centres + 100) ** 3)
 
     def learning(self) -> float:
-        """Return the seconds of both."""
-        return self.hyperparameters() + self.posterior()
+        """Return the seconds of both, and of steps of M along all transitions."""
+        return self.hyperparameters() + self.posterior() + 3 * self.sizes.transitions * self.thinking.speed.another_step
 
     def draws(self, hyperparameters: int) -> float:
         """Return the seconds of draws with so many sets of hyperparameters, which are drawn themselves."""
@@ -355,7 +355,10 @@ class Ledger:
     """
 
     def __init__(self, costs: Costs | None = None) -> None:
-        self.costs, self.reserve, self.spent_up = costs, 0.0, False
+        self.costs, self.spent_up = costs, False
+        # Seconds that a choice needs in any case: of a prediction with the test of its task, and of the smallest search
+        # until one is taken.
+        self.reserve, self.owed = 0.0, 0.0
         self.replaced: list[str] = []
         self.missing = 0.0  # seconds of a stage without which there is no evidence
         self.incomplete = 0.0  # seconds of stages of learning that were left out
@@ -410,9 +413,9 @@ class Ledger:
     def learns(self, kind: str, stage: str, of: Callable[[Costs], float]) -> bool:
         """As :meth:`fits`, of a stage of learning: without it, what is learned decides nothing.
 
-        It leaves what the choice of a task needs in any case, ``reserve``.
+        It leaves what the choice of a task needs in any case.
         """
-        if self.fits(kind, of, self.reserve):
+        if self.fits(kind, of, self.reserve + self.owed):
             return True
         self.incomplete += self.seconds(kind, of)
         self.replaced.append(stage)
@@ -420,7 +423,7 @@ class Ledger:
 
     def optional(self, kind: str, stage: str, of: Callable[[Costs], float]) -> bool:
         """As :meth:`fits`, of a stage that tells more, and on which no verdict rests."""
-        fits = self.fits(kind, of, self.reserve)
+        fits = self.fits(kind, of, self.reserve + self.owed)
         if not fits:
             self.replaced.append(stage)
         return fits

@@ -15,7 +15,7 @@ import scipy
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.texts import parted
 from ctxval.core.learned_numbers import PushedDistances
-from ctxval.learning.closed_loops import LoopPlanner
+from ctxval.learning.closed_loops import LoopPlanner, distances_of
 from ctxval.learning.draws import DisturbedDynamics, DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
@@ -33,11 +33,12 @@ def push_response(
     data, planned = posterior.data, planner.plan(tasks)
     states, n = np.flatnonzero(data.learned), len(data.sizes)
     residuals = (np.abs(data.outputs).max(axis=0) * data.sizes)[states]
-    pushes = np.zeros((len(states), 2, len(LEVELS), n))
-    pushes[np.arange(len(states)), 0, :, states] = residuals[:, None] * LEVELS
+    pushes = np.zeros((len(states), 2, len(LEVELS) - 1, n))
+    pushes[np.arange(len(states)), 0, :, states] = residuals[:, None] * LEVELS[1:]
     pushes[:, 1] = -pushes[:, 0]
     with single_threaded():
         loops = planner.run(posterior.mean, planned)
+        unpushed = np.nan_to_num(distances_of(posterior.mean, loops, planned, len(tasks)), nan=0.0, posinf=np.inf)
         visited = data.geometry.features(np.concatenate([each.states.reshape(-1, n) for each in loops]))
         low, high = np.quantile(visited[np.isfinite(visited).all(axis=1)], [1e-3, 1 - 1e-3], axis=0)
         widths = np.maximum(high - low, 1e-9)
@@ -46,8 +47,9 @@ def push_response(
         for near in (None, recorded):
             dynamics = pushed(posterior.mean, pushes.reshape(-1, n), widths, near)
             distances = np.nan_to_num(planner.distances(dynamics, planned, len(tasks)), nan=0.0, posinf=np.inf)
-            signed = distances.max(axis=1).reshape(pushes.shape[:3])
-            largest.append(np.maximum.accumulate(signed.max(axis=1), axis=1))
+            signed = distances.max(axis=1).reshape(pushes.shape[:3]).max(axis=1)
+            without = np.full((len(states), 1), unpushed.max())
+            largest.append(np.maximum.accumulate(np.concatenate([without, signed], axis=1), axis=1))
     rates = []
     for name, unit in (parted(labels[i]) for i in states.tolist()):
         per_second = f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"

@@ -74,9 +74,7 @@ class MuJoCo:
         self.data, self.sites, self.axes = data, sites, axes
         self._simulate(model)
         self._geometry = _geometry_of(model, tuple(invariant), bool(self.sites))
-        if uncertain:
-            self._parameters = uncertain_parameters(model, uncertain)
-            self.uncertain = tuple(each.prior for each in self._parameters)
+        self._add_uncertain(uncertain or {})
 
     def _simulate(self, model: Any) -> None:
         self._simulator = self._converging = Simulator(model, self.substeps, self.sites, self.axes)
@@ -117,6 +115,16 @@ class MuJoCo:
             another._simulate(model)
         if forces is not None:
             another._forces = forces
+        return another
+
+    def _add_uncertain(self, uncertain: Mapping[str, float | str]) -> None:
+        self._parameters = (*self._parameters, *uncertain_parameters(self.compiled, uncertain))
+        self.uncertain = tuple(each.prior for each in self._parameters)
+
+    def with_uncertain(self, uncertain: Mapping[str, float | str]) -> MuJoCo:
+        """Return the model with further uncertain parameters, which follow its own."""
+        another = copy.copy(self)
+        another._add_uncertain(uncertain)
         return another
 
     def drawn(self, z: Array) -> MuJoCo:

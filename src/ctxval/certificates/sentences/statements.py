@@ -56,8 +56,22 @@ EXECUTED_AGAIN = (
 )
 """The assumption of a statement about executed tasks alone."""
 
+LAW_OF_DISTANCES = (
+    "the logarithm of the distance is normal, with one variance, about a linear function of the logarithms of positive "
+    "task parameters and of the others as they are"
+)
+"""The assumption of a bound on the tasks of a suite that were not executed."""
+
 INDEPENDENT_REPEATS = "executions of one task are independent, and later ones are like those that were recorded"
 """The assumption of a statement about repeated tasks."""
+
+
+def suite_statement(upper: float, confidence: float, tasks: int, left: int) -> str:
+    """Return the bound on a suite of which some tasks are left."""
+    return (
+        f"With {percent(confidence)} probability under a law of the distances, all {tasks} tasks of the suite stay at "
+        f"or below {at_most(upper)}; {left} of them were not executed."
+    )
 
 
 # Independent draws

@@ -21,7 +21,7 @@ def headline(verdict: Verdict, units: str = "") -> str:
     quantile, share = certificate.details.get("quantile"), certificate.volume
     which = f"at least {100 * (1 - share):.4g} % of the tasks stay" if share else "every task stays"
     executions = f" in at least {100 * quantile:g} % of its executions" if quantile else ""
-    if certificate.kind == "suite" and not quantile:
+    if certificate.kind == "suite" and not (quantile or certificate.details.get("not_executed")):
         which = "every task of the suite was executed and stays"
     return f": {which} at or below {threshold}{executions}."
 

@@ -146,6 +146,11 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
             f"{limit} in at least {100 * details['quantile']:g} % of its executions: the bound is {upper}, from at "
             f"least {counted(details['repeats'], 'execution')} of each."
         )
+    if kind == "suite" and details.get("not_executed"):
+        return (
+            f"every task of the suite of {details['tasks']} stays at or below {limit}: the bound is {upper}, with "
+            f"{level} probability under a law of the distances over the task parameters."
+        )
     if kind == "suite":
         return (
             f"all {details['tasks']} tasks of the suite were executed, and no distance exceeds {limit}: the largest is "
@@ -231,9 +236,10 @@ def rests_on(conditions: Sequence[str], certificate: Certificate, tau: float, kn
 
 def _evidence(certificate: Certificate, tau: float, quantities: Quantities) -> str:
     """Return what speaks for a bound on d*: executions, tests of predictions, and what the bound survives."""
-    if (certificate.volume and certificate.kind != "dynamics") or certificate.kind == "suite":
-        return ""
     details, text = certificate.details, str(counted(certificate.trials, "execution"))
+    is_whole = certificate.kind == "suite" and not details.get("not_executed")
+    if (certificate.volume and certificate.kind != "dynamics") or is_whole:
+        return ""
     best, tests, left = details.get("best"), details.get("tests"), details.get("not_executed")
     if best is not None:
         text += f", the largest distance {quantities.of(f'{best:.4g}')}"
@@ -316,6 +322,12 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
         case "suite":
             if details.get("quantile"):
                 return [INDEPENDENT_REPEATS]
+            if details.get("not_executed"):
+                return [
+                    "the logarithm of the distance being normal about a linear function of the logarithms of positive "
+                    "task parameters and of the others as they are",
+                    "no task that was not executed meeting what no execution has met, such as a stop",
+                ]
             return ["an execution of a task again giving the distance that was recorded"]
         case "audit" | "anytime" | "scenario" | "sampling-discarding":
             return [

@@ -310,6 +310,8 @@ def _cost(validation: Validation, plans: Sequence[Plan]) -> Findings:
     text = f"a design takes {thinking.design:.2g} s of CPU, a closed loop on the model {thinking.closed_loop:.2g} s"
     if thinking.choice is not None:
         text += f"; the choice of a task takes about {thinking.choice:.2g} s, and the verdict {thinking.verdict:.2g} s"
+        if thinking.choice > (default := ThinkingSettings().default):
+            text += f", if `--thinking` does not limit them; by default, it is {default:g} s for a choice"
     if thinking.suggestion is not None:
         text += f"; with --explore, a suggestion takes about {thinking.suggestion:.2g} s if it thinks thoroughly "
         text += f"({thinking.designs} designs) and {thinking.fast:.2g} s if it thinks fast"

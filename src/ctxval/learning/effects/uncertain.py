@@ -1,9 +1,11 @@
-"""A model with uncertain parameters whose inputs have effects of uncertain sizes, such as a delay."""
+"""A model with uncertain parameters and effects of uncertain sizes, such as a delay or friction in joints."""
 
 from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+
+import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
@@ -11,11 +13,15 @@ from ctxval.core.model import Model
 from ctxval.core.uncertain import UncertainModel, UncertainParameter
 from ctxval.learning.effects.effect import EffectCandidate, all_sized
 from ctxval.learning.effects.model import ModelWithEffects
+from ctxval.learning.effects.mujoco import SharedAttribute
+from ctxval.models import MuJoCo
 
 
 @dataclass(frozen=True, eq=False)
 class UncertainEffects(ShortRepr):
     """A model with uncertain parameters and effects of its m inputs; their sizes are further parameters.
+
+    Attributes that many elements of an MJCF share are effects, too.
 
     The prior of a size is normal around that of the effect, with a deviation of five of its scales.
     """
@@ -36,10 +42,16 @@ class UncertainEffects(ShortRepr):
 
     def drawn(self, z: Array) -> Model:
         """Return S models with standardised parameters ``(S, K)``; see :class:`UncertainModel`."""
-        of_model = len(self.given.uncertain)
+        model, of_model = self.given, len(self.given.uncertain)
         sizes = (each.at(z[:, k, None]) for k, each in enumerate(self.uncertain) if k >= of_model)
-        effects = tuple(each.effect for each in all_sized(self.effects, sizes))
-        return ModelWithEffects(self.given.drawn(z[:, :of_model]), effects, self.inputs)
+        effects = [each.effect for each in all_sized(self.effects, sizes)]
+        z = z[:, :of_model]
+        shared = [each for each in effects if isinstance(each, SharedAttribute)]
+        if shared and isinstance(model, MuJoCo):  # so all draws run in one batch
+            model = model.with_uncertain({each.parameter: each.unit for each in shared})
+            z = np.concatenate([z, *(each.standardised for each in shared)], axis=1)
+        of_inputs = tuple(each for each in effects if not isinstance(each, SharedAttribute))
+        return ModelWithEffects(model.drawn(z), of_inputs, self.inputs) if of_inputs else model.drawn(z)
 
     @functools.cached_property
     def _usual(self) -> ModelWithEffects:
