@@ -545,6 +545,7 @@ ROBOTS = {
             "latency": {"mass hand": 1.4, "latency": 1.5},
             "armature": {"mass hand": 1.4, "armature": 4.0},
         },
+        tuned=True,
     ),
     "bullet": Robot(
         "the arm in PyBullet, M in MuJoCo", bullet, {"hand": 1.4, "damping": 1.3}, {"engine": {}}, tasks=2_000,
@@ -589,10 +590,11 @@ ROBOTS = {
             "armature": {"friction": 0.8, "armature": 1.3},
             "slope": {"friction": 0.8, "slope": 0.5},
         },
+        tuned=True,
     ),
     "box": Robot(
         "finger that pushes a box", box, {"friction": 0.85, "mass box": 1.2},
-        {"centre of mass": {"friction": 0.85, "centre box": 0.012}},
+        {"centre of mass": {"friction": 0.85, "centre box": 0.012}}, tuned=True,
     ),
     "go1": Robot(
         "Go1, published policy (37 states)", go1, {"friction": 0.8, "mass trunk": 1.15, "gain": 0.9},
@@ -600,7 +602,7 @@ ROBOTS = {
             "joint friction": {"mass trunk": 1.15, "joint friction": 0.3},
             "slope": {"mass trunk": 1.15, "slope": 0.5},
         },
-        tasks=2_000,
+        tasks=2_000, tuned=True,
     ),
 }  # fmt: skip
 
