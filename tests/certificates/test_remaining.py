@@ -92,6 +92,8 @@ def test_what_withdraws_the_bound(trials: list[Trial], beyond: float, code: str 
 def test_a_law_needs_executions_numbers_and_positive_distances() -> None:
     assert left(executed(10, drawn=0)).can_be_bounded
     assert not left(executed(9, drawn=0)).can_be_bounded
+    assert left(executed(33, drawn=2)).can_be_bounded
+    assert not left(executed(33, drawn=1)).can_be_bounded  # the seven that are left would all be tests
     assert not left([*executed(12)[:-1], replace(executed(12)[-1], distance=0.0)]).can_be_bounded
     assert not RemainingTasks(replace(left(executed()).sample, learned=Learned()), 8).can_be_bounded
     exact = judge(executed(), 1.0, CertificateOptions(WholeSuite()), Provenance(space=SUITE))

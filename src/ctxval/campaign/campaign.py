@@ -603,7 +603,8 @@ class Campaign:
             if shortage is None or recorder.validation.space.members is not None:
                 verdict = judge(recorder.trials, threshold, options, known)
             # In a box, another bound has not seen what this evidence might show, such as noise.
-            if shortage is not None and (verdict is None or verdict.answer == "undecided"):
+            decides = verdict is not None and (verdict.answer != "undecided" or verdict.certificate is not None)
+            if shortage is not None and not decides:
                 verdict = Verdict("undecided", threshold, f"{shortage}.", shortage=shortage.to_json())
             assert verdict is not None
             return with_next_task(verdict, recorder, options), known

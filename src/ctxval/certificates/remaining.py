@@ -78,12 +78,12 @@ class RemainingTasks(ShortRepr):
 
     @property
     def can_be_bounded(self) -> bool:
-        """Whether enough positive distances are known for a law, and none is unknown."""
+        """Whether enough positive distances are known for a law, none is unknown, and tasks are left beside tests."""
         sample = self.sample
         if sample.learned is None or sample.learned.suite is None or sample.repeats > 1 or not len(self.rows):
             return False
-        needed = self.limits.freedom + self.runs.features.shape[1] + 1
-        return len(sample) >= needed and bool((sample.distances > 0).all())
+        needed, untested = self.limits.freedom + self.runs.features.shape[1] + 1, self.tests - len(self.drawn)
+        return len(sample) >= needed and untested < len(self.rows) and bool((sample.distances > 0).all())
 
     @cached_property
     def _same(self) -> Mask:

@@ -19,16 +19,16 @@ def reach(p: Parameters) -> Task:
     return Task(np.stack([p.start, 0 * p.start], axis=-1), goal=[p.goal, 0.0], horizon=15, dt=DT)
 
 
-def report(true: str) -> CauseReport:
+def report(true: str, most: int = 1, **uncertain: float | str) -> CauseReport:
     validation = Validation(
         space=TaskSpace(goal=(-1.0, 1.0, "rad"), start=(-0.5, 0.5, "rad")),
         task=reach,
         system=systems.Simulated(models.MuJoCo(true, dt=DT)),
-        model=models.MuJoCo(mjcf(), dt=DT),
+        model=models.MuJoCo(mjcf(), dt=DT, uncertain=uncertain),
         synthesizer=controllers.PID(4.0, 0.0, 0.4),
         distance=distances.MaximumDeviation(components=(0,)),
     )
-    return find_causes(Campaign(validation, search=searches.by_name("random"), seed=0).run(3), most=1)
+    return find_causes(Campaign(validation, search=searches.by_name("random"), seed=0).run(3), most=most)
 
 
 @pytest.mark.slow
@@ -47,3 +47,11 @@ def test_the_attribute_that_differs_is_found(true: str, line: str, says: str) ->
     assert found.named
     assert says.lower() in found.sentence.lower()
     assert any(each.startswith(line) for each in found.mjcf)
+
+
+def test_uncertain_parameters_that_differ_are_causes_with_what_is_found_beside_them() -> None:
+    found = report(mjcf('frictionloss="0.1"', mass=0.7), most=2, mass="30 %", damping=0.1)
+    assert found.named
+    assert [type(cause).__name__ for cause in found.causes] == ["SharedAttribute", "SharedAttribute"]
+    sizes = {cause.parameter: cause.sizes[0] for cause in found.causes}  # type: ignore[attr-defined]
+    assert sizes == pytest.approx({"mass": 1.4, "frictionloss": 0.1}, rel=0.02)

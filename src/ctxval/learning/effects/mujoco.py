@@ -12,6 +12,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
+from ctxval.core.uncertain import UncertainParameter
 from ctxval.errors import InputError
 from ctxval.learning.effects.effect import Effect, EffectCandidate, Observed, Parameter, of_ratio, of_size
 from ctxval.learning.effects.plant import Joint, Plant, plant_of
@@ -92,13 +93,18 @@ class SharedAttribute(OfMuJoCo):
 
     @classmethod
     def candidates(cls, observed: Observed) -> Iterator[EffectCandidate]:
+        return cls.of_elements(observed, 2)  # of one element, other effects of the dictionary are the same
+
+    @classmethod
+    def of_elements(cls, observed: Observed, joints: int) -> Iterator[EffectCandidate]:
+        """Return attributes of so many joints at least, of geoms and of the model; none without a MuJoCo model."""
         plant, compiled = observed.plant, observed.plant.compiled
         if compiled is None:
             return
-        touches = bool(compiled.geom_contype.any() and compiled.geom_conaffinity.any())
-        # Of one element, other effects of the dictionary are the same; without ground, sensors are as likely tilted.
-        several = {"friction"} if touches else set[str]()
-        several |= {"damping", "armature", "stiffness"} if len(plant.joints) > 1 else set()
+        # Without ground, sensors are as likely tilted.
+        ground = bool(((compiled.geom_bodyid == 0) & ((compiled.geom_contype | compiled.geom_conaffinity) > 0)).any())
+        several = {"friction"} if ground else set[str]()
+        several |= {"damping", "armature", "stiffness"} if len(plant.joints) >= joints else set()
         several |= {"gain"} if compiled.actuator_biasprm.any() else set()
         own = [each.name for each in plant.model.uncertain if "[" in each.name]  # type: ignore[attr-defined]
         for name in dict.fromkeys((*sorted(several), *own)):
@@ -106,18 +112,14 @@ class SharedAttribute(OfMuJoCo):
                 uncertain_parameters(compiled, {name: "10 %"})
                 if not name.startswith(("mass", "centre")):
                     yield of_size(cls((1.0,), name), Parameter(name, 0.1, 10.0, 0.1), 0.95, 1.1)
-        inertias = _inertias(compiled)
-        forces = [
-            float(inertias[joint.dof] * observed.missed[joint.rate] / plant.dt)
-            for joint in plant.joints
-            if joint.input is not None
-        ]
-        if len(forces) > 1 and max(forces) > 0:
+        inertias, driven = _inertias(compiled), [joint for joint in plant.joints if joint.input is not None]
+        forces = [float(inertias[joint.dof] * observed.missed[joint.rate] / plant.dt) for joint in driven]
+        if len(forces) >= joints and max(forces) > 0:
             size = float(np.median(forces))
             parameter = Parameter("frictionloss", 0.0, 20 * max(forces), 0.05 * max(size, 1e-9))
             yield of_size(cls((0.0,), "frictionloss", True), parameter, 0.3 * size, size)
         most = float(np.linalg.norm(compiled.opt.gravity))
-        for axis in "xy" if touches and most > 0 else "":
+        for axis in "xy" if ground and most > 0 else "":
             tilt = Parameter(f"gravity_{axis}", -0.5 * most, 0.5 * most, 0.01 * most, "m/s^2")
             yield of_size(cls((0.0,), f"gravity_{axis}", True), tilt, 0.0)
 
@@ -148,6 +150,15 @@ class SharedAttribute(OfMuJoCo):
         return f"{self.parameter} is {size:.3g} times that of M"
 
 
+def attribute_of(prior: UncertainParameter, value: float) -> EffectCandidate:
+    """Return a value of an uncertain parameter of a model as an effect of M."""
+    effect = SharedAttribute((value,), prior.name, added=not prior.relative)
+    if prior.relative:
+        return of_size(effect, Parameter(prior.name, 0.1, 10.0, 0.1), value)
+    most = 20 * prior.deviation + abs(value)
+    return of_size(effect, Parameter(prior.name, -most, most, 0.25 * prior.deviation), value)
+
+
 def further_attributes(model: Model, runs: Sequence[Trajectory]) -> tuple[EffectCandidate, ...]:
     """Return the attributes in which executions may differ from a model beside its uncertain parameters."""
     if not isinstance(model, MuJoCo):
@@ -160,7 +171,7 @@ def further_attributes(model: Model, runs: Sequence[Trajectory]) -> tuple[Effect
     usable = np.isfinite(missed).all(axis=1)
     plant, sizes = plant_of(model, model.dt, states, inputs, x, u), np.sqrt((missed[usable] ** 2).mean(axis=0))
     named = {each.name.partition("[")[0] for each in model.uncertain}
-    shared = SharedAttribute.candidates(Observed(plant, x, u, sizes, 0.0, estimated=False))
+    shared = SharedAttribute.of_elements(Observed(plant, x, u, sizes, 0.0, estimated=False), 1)
     return tuple(each for each in shared if each.parameters[0].name.partition("[")[0] not in named)
 
 

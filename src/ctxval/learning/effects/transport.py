@@ -60,7 +60,7 @@ class Delay(Late):
 
     name: ClassVar[str] = "delay"
     size: ClassVar[Parameter] = Parameter("delay", 0.0, 8.0, 0.2, "steps")
-    guesses: ClassVar[tuple[float, ...]] = (0.5, 1.5, 2.5, 4.0)
+    guesses: ClassVar[tuple[float, ...]] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
 
     @property
     def actuator(self) -> Actuator:

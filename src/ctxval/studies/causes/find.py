@@ -19,15 +19,20 @@ from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError
 from ctxval.learning.effects.dictionary import candidates
-from ctxval.learning.effects.effect import Effect, EffectCandidate
+from ctxval.learning.effects.effect import Effect, EffectCandidate, all_sized
 from ctxval.learning.effects.fit import Explanation, Segments, SegmentSettings, explained, screened
 from ctxval.learning.effects.force import Force
 from ctxval.learning.effects.joint_stop import seen_stops
 from ctxval.learning.effects.model import ModelWithEffects
+from ctxval.learning.effects.mujoco import attribute_of, further_attributes
 from ctxval.learning.effects.plant import plant_of
 from ctxval.learning.effects.sensor import SensorOffset, wrapped_angles
 from ctxval.learning.effects.transport import ObservationDelay
+from ctxval.learning.effects.uncertain import UncertainEffects
 from ctxval.learning.extended import estimates_by_loops_on_model
+from ctxval.learning.input_effects import input_candidates
+from ctxval.learning.parameter_posterior import ParameterSettings, most_probable
+from ctxval.models import MuJoCo
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
 
 
@@ -44,6 +49,8 @@ class CauseSettings:
     failed: int = 4  # executions among them that failed
     away: float = 30.0  # ranges of the states that M predicted, beyond which a failed execution says nothing of M
     steps: int = 5  # of a failed execution
+    # Prior deviations from M, and deviations of the posterior, by which an uncertain parameter of M must differ
+    differs: tuple[float, float] = (0.02, 3.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +204,7 @@ class _Study:
     def __init__(
         self, validation: Validation, executions: list[ExecutedTask], runs: list[Trajectory], settings: CauseSettings
     ) -> None:
-        self.validation, self.executions, self.model = validation, executions, validation.model
+        self.validation, self.executions, self.model, self.runs = validation, executions, validation.model, runs
         self.settings = settings
         self.outputs = validation.outputs.hide_states
         horizon = min(len(run.inputs) for run in runs)
@@ -245,6 +252,9 @@ class _Study:
                 return self._reported([first], [], False)
             offset = self._offset_of_starts()
             return self._reported([] if offset is None else [replace(first, explanation=offset)], [], True)
+        parameters = None if self.known or self.outputs else self._of_parameters()
+        if parameters is not None and parameters.counts(self.before) and parameters.complete >= self.settings.named:
+            return self._reported([parameters], [], False)
         with stage("fitting causes", (2 * most - 1) * len(self.dictionary), "causes"):
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
@@ -267,6 +277,35 @@ class _Study:
         if chosen is None and first is not None and self.known:
             chosen, alike = first, []
         return self._reported([] if chosen is None else [chosen, *alike], ranked, False)
+
+    def _of_parameters(self) -> Explained | None:
+        """Return the uncertain parameters that differ from those of M, with what is found beside them as in verdicts.
+
+        Returns None if M has none, or is no model of MuJoCo.
+        """
+        model, plant = self.model, self.plant
+        if not isinstance(model, MuJoCo) or not model.uncertain:
+            return None
+        commands, seconds = np.concatenate([run.inputs for run in self.runs]), max(r.times[-1] for r in self.runs)
+        late = input_candidates(model, plant.dt, plant.inputs, commands, float(seconds), together=True)
+        beside, rng = (*late, *further_attributes(model, self.runs)), np.random.default_rng(0)
+        found = most_probable(model, self.runs, beside, None, rng, ParameterSettings())
+        if found is None:
+            return None
+        deviations = np.sqrt(np.diag(np.linalg.inv(found.precision)))
+        sizes = [float(each.at(z)) for each, z in zip(found.model.uncertain, found.z, strict=True)]
+        least, many = self.settings.differs
+        differing = tuple(
+            attribute_of(each, size)
+            for each, size, z, deviation in zip(model.uncertain, sizes, found.z, deviations, strict=False)
+            if abs(z) > max(least, many * deviation)
+        )
+        effects = found.model.effects if isinstance(found.model, UncertainEffects) else ()
+        candidates = (*differing, *all_sized(effects, sizes[len(model.uncertain) :]))
+        if not candidates:
+            return None
+        begun = [float(size) for each in candidates for size in each.effect.sizes]
+        return self._in_closed_loop(explained(self.segments, candidates, begun, near=True))
 
     def _fitted(self, chosen: Explained) -> tuple[EffectCandidate, ...]:
         return chosen.explanation.candidates[len(self.known) :]
