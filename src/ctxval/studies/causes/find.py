@@ -24,7 +24,7 @@ from ctxval.learning.effects.fit import Explanation, Segments, SegmentSettings, 
 from ctxval.learning.effects.force import Force
 from ctxval.learning.effects.joint_stop import seen_stops
 from ctxval.learning.effects.model import ModelWithEffects
-from ctxval.learning.effects.mujoco import attribute_of, further_attributes
+from ctxval.learning.effects.mujoco import SharedAttribute, attribute_of, further_attributes
 from ctxval.learning.effects.plant import plant_of
 from ctxval.learning.effects.sensor import SensorOffset, wrapped_angles
 from ctxval.learning.effects.transport import ObservationDelay
@@ -304,8 +304,14 @@ class _Study:
         candidates = (*differing, *all_sized(effects, sizes[len(model.uncertain) :]))
         if not candidates:
             return None
-        begun = [float(size) for each in candidates for size in each.effect.sizes]
-        return self._in_closed_loop(explained(self.segments, candidates, begun, near=True))
+        fitted = explained(
+            self.segments, candidates, [float(s) for each in candidates for s in each.effect.sizes], near=True
+        )
+        # What the parameters needed on the way, and all records do not.
+        kept = tuple(each for each in fitted.candidates if not _is_nothing(each))
+        if kept and len(kept) < len(candidates):
+            fitted = explained(self.segments, kept, [float(s) for each in kept for s in each.effect.sizes], near=True)
+        return self._in_closed_loop(fitted)
 
     def _fitted(self, chosen: Explained) -> tuple[EffectCandidate, ...]:
         return chosen.explanation.candidates[len(self.known) :]
@@ -449,6 +455,14 @@ class _Study:
                     apart = float(self.validation.distance_between(first, loop, plan.task))
                     best = Separating(space.describe_point(point), apart, number, gap)
         return best
+
+
+def _is_nothing(candidate: EffectCandidate) -> bool:
+    """Return whether an attribute differs from that of M by less than a hundredth of what matters."""
+    effect = candidate.effect
+    if not isinstance(effect, SharedAttribute):
+        return False
+    return abs(float(effect.sizes[0]) - (0.0 if effect.added else 1.0)) < 0.01 * candidate.parameters[0].scale
 
 
 def _unsized(candidate: EffectCandidate) -> Effect:
