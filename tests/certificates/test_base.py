@@ -125,7 +125,7 @@ def test_the_kinds_of_this_package_are_listed_by_name() -> None:
 
 def test_which_kinds_have_a_use_for_an_option_follows_from_their_fields() -> None:
     uses = {
-        "tests": ("auto", "dynamics"),
+        "tests": ("auto", "dynamics", "suite"),
         "resolution": ("auto", "posterior"),
         "volume": ("anytime", "audit", "sampling-discarding", "scenario"),
         "discard": ("sampling-discarding",),

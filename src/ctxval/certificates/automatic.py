@@ -147,7 +147,7 @@ class Automatic(CertificateKind):
         return usual and sample.not_executed != 0
 
     def without_dynamics(self, target: Target, suite: Array | None) -> CertificateKind:
-        """Return the kind that judges the distances alone; of noise or a share of the tasks, none does."""
+        """Return the kind that judges the distances of tasks ``(n, d)`` alone; of noise or a share, none does."""
         match target:
             case Largest() if suite is None:
                 return DistanceBound(self.resolution)

@@ -143,7 +143,7 @@ class CertificateKind(ShortRepr, ABC):
         return False
 
     def without_dynamics(self, target: Target, suite: Array | None) -> CertificateKind:
-        """Return the kind that judges if learned dynamics do not, of a target and the tasks of a suite if it is one."""
+        """Return the kind that judges without learned dynamics, of a target and the tasks ``(n, d)`` of a suite."""
         return self
 
     @abstractmethod
