@@ -17,7 +17,7 @@ verdict = campaign.verdict(experiment.threshold)
 print(verdict)
 
 # %%
-# The bound is one on the 0.9 quantile of the distance in every task.
+# The dash-dotted lines are the threshold and, if the verdict has one, the bound on the 0.9 quantile in every task.
 space = campaign.validation.space
 unit = np.linspace(0, 1, 401)[:, None]
 mean, deviation = campaign.surrogate().predict(unit)
@@ -26,7 +26,7 @@ figure, axes = pyplot.subplots(layout="constrained")
 axes.fill_between(goals, np.maximum(mean - 1.96 * deviation, 0), mean + 1.96 * deviation, color="#B0B0B0", alpha=0.6)
 axes.plot(goals, mean)
 axes.plot(*zip(*[(trial.parameters["goal"], trial.distance) for trial in campaign.completed], strict=True), "ko")
-for limit in (experiment.threshold, verdict.bound):
+for limit in filter(None, (experiment.threshold, verdict.bound)):
     axes.axhline(limit, linestyle="-.")
 axes.set(xlabel=space.labels[0], ylabel="distance [rad]")
 pyplot.show()
