@@ -195,7 +195,7 @@ def test_a_law_of_the_distances_bounds_a_suite_whose_dynamics_take_too_long_to_l
     verdict = campaign.verdict(1.25 * largest, thinking=1e-4)
     assert verdict.answer == "validated"
     assert 18 <= campaign.executions <= 30
-    assert largest <= (verdict.bound or 0.0) <= 1.25 * largest
+    assert (1 - 1e-9) * largest <= (verdict.bound or 0.0) <= 1.25 * largest
     certificate = verdict.certificate
     assert certificate is not None
     assert (certificate.kind, certificate.details["not_executed"]) == ("suite", 41 - campaign.executions)

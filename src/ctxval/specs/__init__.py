@@ -5,10 +5,12 @@ from __future__ import annotations
 from ctxval._util.registry import Registry
 from ctxval.specs.reach_avoid import ReachAvoid, Specification
 from ctxval.specs.sets import SETS, Ball, Box, Outside, Polytope, Set, Union
+from ctxval.specs.stl import STL
 
 __all__ = [
     "REGISTRY",
     "SETS",
+    "STL",
     "Ball",
     "Box",
     "Outside",
