@@ -6,7 +6,6 @@ The running example as it would be on a bench. Nothing of this is declared: nois
 executions, and the verdict is about nine of ten executions of each task.
 """
 
-import numpy as np
 from matplotlib import pyplot
 
 from ctxval import Campaign, cases
@@ -18,15 +17,9 @@ print(verdict)
 
 # %%
 # The dash-dotted lines are the threshold and, if the verdict has one, the bound on the 0.9 quantile in every task.
-space = campaign.validation.space
-unit = np.linspace(0, 1, 401)[:, None]
-mean, deviation = campaign.surrogate().predict(unit)
-goals = space.from_unit(unit)[:, 0]
 figure, axes = pyplot.subplots(layout="constrained")
-axes.fill_between(goals, np.maximum(mean - 1.96 * deviation, 0), mean + 1.96 * deviation, color="#B0B0B0", alpha=0.6)
-axes.plot(goals, mean)
 axes.plot(*zip(*[(trial.parameters["goal"], trial.distance) for trial in campaign.completed], strict=True), "ko")
 for limit in filter(None, (experiment.threshold, verdict.bound)):
     axes.axhline(limit, linestyle="-.")
-axes.set(xlabel=space.labels[0], ylabel="distance [rad]")
+axes.set(xlabel=campaign.validation.space.labels[0], ylabel="distance [rad]")
 pyplot.show()

@@ -599,14 +599,15 @@ class Campaign:
         recorder.dynamics.shortage = None
         with stage("certifying"), recorder.dynamics.thinking.limited(thinking):
             known, shortage = self.provenance_for(options, threshold), recorder.dynamics.shortage
-            verdict = None
-            if shortage is None or recorder.validation.space.members is not None:
+            if shortage is None:
                 verdict = judge(recorder.trials, threshold, options, known)
-            # In a box, another bound has not seen what this evidence might show, such as noise.
-            decides = verdict is not None and (verdict.answer != "undecided" or verdict.certificate is not None)
-            if shortage is not None and not decides:
+            else:
                 verdict = Verdict("undecided", threshold, f"{shortage}.", shortage=shortage.to_json())
-            assert verdict is not None
+                # In a box, another bound has not seen what the missing evidence might show, such as noise.
+                if recorder.validation.space.members is not None:
+                    by_distances = judge(recorder.trials, threshold, options, known)
+                    undecided = by_distances.answer == "undecided" and by_distances.certificate is None
+                    verdict = verdict if undecided else by_distances
             return with_next_task(verdict, recorder, options), known
 
     @checked

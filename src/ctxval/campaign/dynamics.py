@@ -34,7 +34,7 @@ from ctxval.core.trial import REDEFINED, Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
-from ctxval.learning.coverage import unsampled_corner
+from ctxval.learning.coverage import beyond_range, unsampled_corner
 from ctxval.learning.prediction import Executed
 from ctxval.learning.sensitivity import Sensitivity, found_sensitivity
 from ctxval.learning.stage_costs import Ledger
@@ -473,10 +473,9 @@ class CampaignDynamics:
                     for planned in self.study.planner.plan(member[None]):
                         of_suite[row] = _ends(planned.nominal.states, planned.nominal.inputs)
             self._of_suite = of_suite
-        low, high = np.min(records, axis=0)[0], np.max(records, axis=0)[1]
-        lows, highs = np.moveaxis(self._of_suite, 1, 0)
-        beyond = np.maximum(np.maximum(low - lows, highs - high), 0.0) / np.maximum(high - low, 1e-9)
-        return SuiteRuns(features, np.where(np.isfinite(beyond), beyond, np.inf).max(axis=1))
+        recorded = np.concatenate(records)
+        beyond = beyond_range(recorded, self._of_suite) / np.maximum(np.ptp(recorded, axis=0), 1e-9)
+        return SuiteRuns(features, np.where(np.isfinite(beyond), beyond, np.inf).max(axis=(1, 2)))
 
     def stored_prediction(self, trial: Trial) -> ExecutionPrediction | None:
         """Return the prediction that was stored before an execution, if it is one of the present distance."""

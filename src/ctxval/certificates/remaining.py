@@ -91,7 +91,7 @@ class RemainingTasks(ShortRepr):
         assert self.sample.suite is not None
         return np.asarray(np.abs(self.sample.suite[:, None] - self.sample.points).max(axis=2) <= SAME)
 
-    @property
+    @cached_property
     def rows(self) -> Rows:
         """The rows of the tasks in the suite."""
         return np.flatnonzero(~self._same.any(axis=1))
@@ -108,7 +108,7 @@ class RemainingTasks(ShortRepr):
         """The features of the trials' tasks ``(n, k)``."""
         return np.asarray(self.runs.features[self._same.argmax(axis=0)])
 
-    @property
+    @cached_property
     def law(self) -> DistanceLaw:
         """The law of the distances of the tasks, given all executions."""
         return DistanceLaw.given(self._executed, self.sample.distances, self.runs.features[self.rows])
@@ -123,7 +123,7 @@ class RemainingTasks(ShortRepr):
         """The rows of the trials whose tasks were drawn."""
         return [row for row, origin in enumerate(self.sample.origins) if origin in DRAWN]
 
-    @property
+    @cached_property
     def against(self) -> float:
         """The evidence of the drawn tasks against the law of the executions before each.
 
@@ -158,8 +158,7 @@ class RemainingTasks(ShortRepr):
 
     def next_row(self, threshold: float) -> int | None:
         """Return the row of the suite's task to execute next; None if a task that is drawn comes next."""
-        if float(self.beyond.max()) > self.limits.gap:
-            return int(self.rows[self.beyond.argmax()])
-        if len(self.drawn) < self.tests:
+        code, _ = self.withdrawal() or (None, "")
+        if code == "tests_missing":
             return None
-        return int(self.rows[self.law.above(threshold).argmax()])
+        return int(self.rows[(self.beyond if code == "beyond" else self.law.above(threshold)).argmax()])

@@ -36,7 +36,7 @@ def coverage(
     visited, rows = _visited(posterior, loops), np.concatenate([tasks.rows for tasks in planned])
     width = np.maximum(np.ptp(_ends(visited, (0, 1)), axis=0), 1e-9)
     recorded, scaled = posterior.data.recorded / width, visited / width
-    beyond = _beyond(recorded, scaled)
+    beyond = beyond_range(recorded, scaled)
     # Gaps between the records are looked for in a part of the tasks and of the steps.
     compared = _some(len(scaled), 256)
     some = scaled[compared][:, _some(scaled.shape[1], 40)]
@@ -82,11 +82,11 @@ def beyond_records(
     width = np.maximum(np.ptp(_ends(_visited(posterior, of_pool), (0, 1)), axis=0), 1e-9)
     data = posterior.data
     recorded = (data.recorded[data.executed] if executed_only else data.recorded) / width
-    return [_beyond(recorded, _visited(posterior, [each]) / width).max(axis=(1, 2)) for each in loops]
+    return [beyond_range(recorded, _visited(posterior, [each]) / width).max(axis=(1, 2)) for each in loops]
 
 
-def _beyond(recorded: Array, visited: Array) -> Array:
-    """Return the excess of each coordinate over its largest record, or below its smallest one."""
+def beyond_range(recorded: Array, visited: Array) -> Array:
+    """Return the excess ``(..., k)`` of coordinates over the largest of records ``(N, k)``, or below the smallest."""
     return np.asarray(np.maximum(np.maximum(visited - recorded.max(axis=0), recorded.min(axis=0) - visited), 0.0))
 
 
