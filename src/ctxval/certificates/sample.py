@@ -34,7 +34,11 @@ class RecoveredFailure(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Sample(ShortRepr):
-    """Executed trials as a certificate sees them: points, distances, and why each task was chosen."""
+    """Executed trials as a certificate sees them: points, distances, and why each task was chosen.
+
+    Raises:
+        CertificateError: if trials are open, or if the lists differ in length.
+    """
 
     points: Array  #: tasks as points of the unit cube, shape ``(n, d)``
     distances: Array  #: their distances, shape ``(n,)``; NaN if the execution failed or could not be measured
@@ -76,6 +80,9 @@ class Sample(ShortRepr):
 
         A failure is left out if the same task was executed with success later, unless it is an independent draw. The
         order of trials that people chose or imported has no meaning, so they are sorted by their tasks.
+
+        Raises:
+            CertificateError: if there are no trials.
         """
         if not trials:
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
@@ -140,7 +147,11 @@ class Sample(ShortRepr):
 
     @property
     def members(self) -> Array:
-        """The tasks of the suite, points of the unit cube ``(N, d)``; a CertificateError is raised without one."""
+        """The tasks of the suite, points of the unit cube ``(N, d)``; a CertificateError is raised without one.
+
+        Raises:
+            CertificateError: if tasks fill a box.
+        """
         if self.suite is None:
             raise CertificateError("tasks fill a box here, so they cannot all be executed; this kind is for a suite.")
         return self.suite
@@ -210,7 +221,11 @@ class Sample(ShortRepr):
 
 
 def require_learned(sample: Sample, kind: str) -> Learned:
-    """Return the predictions that come with a sample, which this kind of certificate needs."""
+    """Return the predictions that come with a sample, which this kind of certificate needs.
+
+    Raises:
+        CertificateError: if the experiment is not loaded.
+    """
     if sample.learned is None:
         raise CertificateError(
             f"the {kind} certificate uses what the experiment's model predicts, but the experiment is not loaded: use "

@@ -163,6 +163,9 @@ def completion(validation: Validation) -> Distance:
     :class:`ctxval.distances.TrackingError`. For a :class:`ctxval.distances.BodyVelocity` and tasks with a command it is
     :class:`ctxval.distances.CommandError`. If the distance compares all states, those are left out that the
     synthesizer does not bring to a goal.
+
+    Raises:
+        InputError: if tasks have no goal.
     """
     space, distance = validation.space, validation.distance
     distance = distance.distance if isinstance(distance, UntilFall) else distance
