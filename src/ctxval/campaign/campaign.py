@@ -26,7 +26,6 @@ from ctxval._util.progress import progress_shown, stage
 from ctxval._util.representation import call
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
-from ctxval.campaign.dynamics import SENSITIVITY
 from ctxval.campaign.envelope import EnvelopeSearch
 from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.executors import Executor, worker_pool
@@ -157,8 +156,7 @@ class Campaign:
     @property
     def sensitivity(self) -> Sensitivity | None:
         """How far small changes move closed loops of M if these are not smooth, as found before the first execution."""
-        notes = (trial.note or {} for trial in self.trials[:1])
-        return next((Sensitivity.from_json(note.get(SENSITIVITY)) for note in notes), None)
+        return next((Sensitivity.from_json(trial.note.sensitivity) for trial in self.trials[:1]), None)
 
     def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
         """Return the trajectories of the model and of the system in a trial; None if a trajectory is not stored.

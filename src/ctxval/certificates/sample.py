@@ -12,15 +12,11 @@ from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
 from ctxval.certificates.evidence import Learned
-from ctxval.certificates.prediction_tests import hypercube_in
 from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
 from ctxval.errors import CertificateError
 
 SAME = 1e-9
 """Points of the unit cube that differ by no more than this are the same task."""
-
-PLANNED = "draws"
-"""Key of the planned number of draws in the note of an independent draw."""
 
 
 @dataclass(frozen=True)
@@ -104,17 +100,17 @@ class Sample(ShortRepr):
         )
         for place, trial in zip(places, manual, strict=True):
             counted[place] = trial
-        planned = [(trial.note or {}).get(PLANNED) if trial.origin == "iid" else None for trial in counted]
+        planned = [trial.note.draws if trial.origin == "iid" else None for trial in counted]
         return cls(
             np.array([trial.unit_point for trial in counted]),
             np.array([np.nan if trial.distance is None else trial.distance for trial in counted]),
             [trial.origin for trial in counted],
             [trial.state for trial in counted],
             [trial.number for trial in counted],
-            [each if isinstance(each, int) else None for each in planned],
+            planned,
             tuple(made_good),
             learned,
-            selected=float(np.prod([chosen[1] for trial in trials if (chosen := hypercube_in(trial.note))])),
+            selected=float(np.prod([chosen[1] for trial in trials if (chosen := trial.note.hypercube)])),
         )
 
     def only(self, origin: Origin) -> Sample:
