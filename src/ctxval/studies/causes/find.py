@@ -41,6 +41,7 @@ class CauseSettings:
     """How many causes are tried, and how much of the deviations of M they must explain."""
 
     named: float = 0.98  # share of the squared deviations of M in closed loop that causes must explain, to be the cause
+    partial: float = 0.9  # share that M's parameters must explain for no further cause to be looked for
     little: float = 0.1  # share of the squared deviations that is not worth a sentence
     alike: float = 10.0  # differences of the criterion that do not tell causes apart
     fitted: int = 8  # explanations by one more cause that are fitted to all records
@@ -253,7 +254,7 @@ class _Study:
             offset = self._offset_of_starts()
             return self._reported([] if offset is None else [replace(first, explanation=offset)], [], True)
         parameters = None if self.known or self.outputs else self._of_parameters()
-        if parameters is not None and parameters.counts(self.before) and parameters.complete >= self.settings.named:
+        if parameters is not None and parameters.counts(self.before) and parameters.complete >= self.settings.partial:
             return self._reported([parameters], [], False)
         with stage("fitting causes", (2 * most - 1) * len(self.dictionary), "causes"):
             ranked = self._ranked(())
@@ -274,6 +275,9 @@ class _Study:
                 if 1 - better.complete > 0.5 * (1 - chosen.complete):
                     break
                 chosen, alike = better, others
+        left = 1.0 if chosen is None else 1 - chosen.share
+        if parameters is not None and parameters.counts(self.before) and 1 - parameters.share <= 0.5 * left:
+            chosen, alike = parameters, []
         if chosen is None and first is not None and self.known:
             chosen, alike = first, []
         return self._reported([] if chosen is None else [chosen, *alike], ranked, False)
