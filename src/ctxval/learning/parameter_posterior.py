@@ -12,7 +12,7 @@ mode is found by Gauss-Newton steps, and draws come from population Monte Carlo 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -326,6 +326,12 @@ class _Structures:
             mode = longer
         return mode
 
+    @property
+    def rounds(self) -> int:
+        """How many rounds the search from all of the prior takes."""
+        settings, kinds = self.settings, len({each.effect.kind for each in self.candidates})
+        return (1 + kinds) * settings.first_rounds + settings.starts * settings.further_rounds + settings.last_rounds
+
     def from_prior(self, segments: Segments, rng: np.random.Generator) -> ParameterMode:
         """Return the mode with one effect, or none, whose parameters and size are looked for together."""
         settings, seen, searches = self.settings, list[object](), list[CrossEntropySearch]()
@@ -361,12 +367,14 @@ def most_probable(
     known: Sequence[EffectCandidate] | None,
     rng: np.random.Generator,
     settings: ParameterSettings,
+    affords: Callable[[int], bool] = lambda steps: True,
 ) -> ParameterMode | None:
     """Return the mode of parameters and effects; None without segments.
 
     Effects are looked for among candidates, or are the ``known`` ones, whose sizes are fitted again. Gauss-Newton steps
     begin at the prior's mean. If they explain too little, the mode of single steps, of which more are without a change
-    of contacts, is looked for from all of the prior: of the parameters, then with each effect.
+    of contacts, is looked for from all of the prior: of the parameters, then with each effect, if so many steps of the
+    model can be afforded.
     """
     segments, structures = Segments.of(model, executed, rng, settings), _Structures(model, candidates, settings)
     if segments is None:
@@ -377,13 +385,19 @@ def most_probable(
     short = None if mode.explains else Segments.of(model, executed, rng, replace(settings, steps=1))
     if short is None:
         return mode
-    search = CrossEntropySearch(mode.model, short, settings)
-    found = search.advance(settings.first_rounds + settings.further_rounds + settings.last_rounds, rng).mode
-    mode = found if found.left < mode.left else mode
+    rounds = settings.first_rounds + settings.further_rounds, settings.last_rounds
+    of_round = settings.samples * len(short.states)
+    if affords(sum(rounds) * of_round):
+        search = CrossEntropySearch(mode.model, short, settings)
+        for each in rounds:
+            found = search.advance(each, rng).mode
+            mode = found if found.left < mode.left else mode
+            if mode.explains:
+                break
     if known is not None or mode.explains:
         return mode
     mode = structures.greedily(mode)
-    if mode.explains:
+    if mode.explains or not affords(structures.rounds * of_round):
         return mode
     found = structures.greedily(structures.from_prior(short, rng))
     return found if found.left < mode.left else mode

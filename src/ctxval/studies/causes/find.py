@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -32,26 +33,10 @@ from ctxval.learning.effects.uncertain import UncertainEffects
 from ctxval.learning.extended import estimates_by_loops_on_model
 from ctxval.learning.input_effects import input_candidates
 from ctxval.learning.parameter_posterior import ParameterSettings, most_probable
+from ctxval.learning.stage_costs import Ledger
 from ctxval.models import MuJoCo
+from ctxval.studies.causes.budget import CauseCosts, CauseSettings, fitting_settings
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
-
-
-@dataclass(frozen=True)
-class CauseSettings:
-    """How many causes are tried, and how much of the deviations of M they must explain."""
-
-    named: float = 0.98  # share of the squared deviations of M in closed loop that causes must explain, to be the cause
-    partial: float = 0.9  # share that M's parameters must explain for no further cause to be looked for
-    little: float = 0.1  # share of the squared deviations that is not worth a sentence
-    alike: float = 10.0  # differences of the criterion that do not tell causes apart
-    fitted: int = 8  # explanations by one more cause that are fitted to all records
-    checked: int = 4  # explanations that are tried in closed loop
-    executions: int = 8  # that are explained at most
-    failed: int = 4  # executions among them that failed
-    away: float = 30.0  # ranges of the states that M predicted, beyond which a failed execution says nothing of M
-    steps: int = 5  # of a failed execution
-    # Prior deviations from M, and deviations of the posterior, by which an uncertain parameter of M must differ
-    differs: tuple[float, float] = (0.02, 3.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +143,9 @@ class ClosedLoops:
         return np.inf
 
 
-def find_causes(campaign: Campaign, *, most: int = 2, settings: CauseSettings = CauseSettings()) -> CauseReport:
+def find_causes(
+    campaign: Campaign, *, most: int = 2, thinking: float | None = None, settings: CauseSettings | None = None
+) -> CauseReport:
     """Return what M lacks, found in the executions of a campaign. Nothing is executed.
 
     Every cause of the dictionary is fitted alone, and then each beside the best one. The Bayesian information criterion
@@ -168,12 +155,17 @@ def find_causes(campaign: Campaign, *, most: int = 2, settings: CauseSettings = 
 
     Args:
         most: the largest number of causes together.
+        thinking: seconds of CPU, as in :meth:`ctxval.Campaign.verdict`. Fewer executions are read, and stages left out,
+            if the search does not fit; the report says so.
         settings: how many causes are tried, and what they must explain.
 
     Raises:
-        InputError: if there are fewer than two executions with trajectories, or if they do not say enough.
+        InputError: if there are fewer than two executions with trajectories, if they do not say enough, or if even the
+            smallest search does not fit into ``thinking``.
     """
     validation = campaign.validation
+    ledger = campaign.recorder.dynamics.ledger_of_decision(thinking, campaign.trials)
+    settings = fitting_settings(ledger, settings or CauseSettings())
     trials = sorted(executed_trials(campaign.store, campaign.trials), key=lambda pair: -(pair[0].distance or 0.0))
     failed = list[tuple[Trial, Trajectory]]()
     for trial in () if validation.outputs.hide_states else campaign.failed:
@@ -198,16 +190,26 @@ def find_causes(campaign: Campaign, *, most: int = 2, settings: CauseSettings = 
             raise InputError("the states of the model cannot be estimated from the recorded outputs.")
         plan = validation.plan
         executions = [ExecutedTask(plan(validation.space.from_unit(point)), run) for point, run in executed]
-        return replace(_Study(validation, executions, states, settings).report(most), failed=len(failed))
+        kind = _EstimatedStudy if validation.outputs.hide_states else _Study
+        report = kind(validation, executions, states, settings, ledger).report(most)
+        return replace(report, failed=len(failed), replaced=tuple(ledger.replaced))
 
 
 class _Study:
+    """What explains the executions of a validation whose states are recorded."""
+
+    estimated: ClassVar[bool] = False
+
     def __init__(
-        self, validation: Validation, executions: list[ExecutedTask], runs: list[Trajectory], settings: CauseSettings
+        self,
+        validation: Validation,
+        executions: list[ExecutedTask],
+        runs: list[Trajectory],
+        settings: CauseSettings,
+        ledger: Ledger,
     ) -> None:
         self.validation, self.executions, self.model, self.runs = validation, executions, validation.model, runs
-        self.settings = settings
-        self.outputs = validation.outputs.hide_states
+        self.settings, self.ledger = settings, ledger
         horizon = min(len(run.inputs) for run in runs)
         # What inputs and jumps of the records tell is known, and not fitted.
         old = observation_delay([(each.plan.controller, each.plan.task, each.executed) for each in executions])
@@ -216,12 +218,10 @@ class _Study:
             following = [np.asarray(self.model.step(*map(np.array, (run.states[:-1], run.inputs)))) for run in runs]
         self.known = (*late, *wrapped_angles([run.states for run in runs], following))
         known = tuple(each.effect for each in self.known)
-        # Estimated states are worth little in one step.
-        long = SegmentSettings((max(1, horizon // 60), max(1, horizon // 12)))
-        taken = long if self.outputs else SegmentSettings()
+        taken = self._segments_of(horizon).part(settings.segments)
         self.segments = Segments(self.model, runs, settings=taken, known=known)
         floors = [window.floors for window in self.segments.windows]
-        self.some = Segments(self.model, runs, floors, (200, 40), taken, known)  # all causes are screened on these
+        self.some = Segments(self.model, runs, floors, taken.part(1 / 3), known)  # all causes are screened on these
         numbers = range(len(runs))
         self.others = [
             Segments(self.model, [runs[k] for k in rest], floors, settings=taken, known=known, numbers=rest)
@@ -233,33 +233,46 @@ class _Study:
             raise InputError("the model's steps are not finite at the recorded states.")
         names = validation.names(x.shape[1], u.shape[1])
         self.plant = plant_of(self.model, executions[0].plan.task.dt, *names, x[usable], u[usable])
-        if not self.outputs:
-            states = [run.states for run in runs]
-            self.known = (*self.known, *seen_stops(self.plant.joints, states, following, self.plant.dt))
+        self.known = (*self.known, *self._stops(following))
         seconds = max(run.horizon for run in runs) * self.plant.dt
         records = x[usable], u[usable], residuals[usable]
-        estimated, count = self.outputs, len(runs)
-        self.dictionary = candidates(self.plant, *records, seconds=seconds, estimated=estimated, runs=count)
+        self.dictionary = candidates(self.plant, *records, seconds=seconds, estimated=self.estimated, runs=len(runs))
         self.loops = ClosedLoops(validation, executions)
         self.before = max(self.loops.distances)
 
+    def _segments_of(self, horizon: int) -> SegmentSettings:
+        return SegmentSettings()
+
+    def _stops(self, following: list[Array]) -> Iterable[EffectCandidate]:
+        return seen_stops(self.plant.joints, [run.states for run in self.runs], following, self.plant.dt)
+
+    def _by_what_is_seen(self) -> Explained | None:
+        """Return how well what inputs and jumps of the records tell explains the executions."""
+        known = ModelWithEffects(self.model, tuple(each.effect for each in self.known))
+        return self._in_closed_loop(Explanation(self.known, known, 0.0, 1.0))
+
+    def _noise(self, explanation: Explanation) -> Array:
+        return self.segments.noise(explanation.repaired)
+
+    def _distance_from_tasks(self, repaired: ModelWithEffects) -> float | None:
+        return self.loops.distance_from_tasks(repaired)
+
     def report(self, most: int) -> CauseReport:
-        first = None
-        if self.known or not self.outputs:
-            known = ModelWithEffects(self.model, tuple(each.effect for each in self.known))
-            first = self._in_closed_loop(Explanation(self.known, known, 0.0, 1.0))
+        first = self._by_what_is_seen()
         if first is not None and first.complete >= self.settings.named:
             if self.known:
                 return self._reported([first], [], False)
             offset = self._offset_of_starts()
             return self._reported([] if offset is None else [replace(first, explanation=offset)], [], True)
-        parameters = None if self.known or self.outputs else self._of_parameters()
+        parameters = None if self.known else self._of_parameters()
         if parameters is not None and parameters.counts(self.before) and parameters.complete >= self.settings.partial:
             return self._reported([parameters], [], False)
         with stage("fitting causes", (2 * most - 1) * len(self.dictionary), "causes"):
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
             while chosen is not None and chosen.counts(self.before) and len(self._fitted(chosen)) < most:
+                if not self._affords("a further cause", CauseCosts.second):
+                    break
                 is_small = chosen.explanation.left < 0.02 and chosen.complete >= self.settings.named
                 if is_small or chosen.complete > 0.99:  # nothing is left for another cause
                     break
@@ -282,6 +295,10 @@ class _Study:
             chosen, alike = first, []
         return self._reported([] if chosen is None else [chosen, *alike], ranked, False)
 
+    def _affords(self, stage: str, of: Callable[[CauseCosts], float]) -> bool:
+        """Return whether an optional stage fits into the budget; it is left out otherwise."""
+        return self.ledger.optional("causes", stage, lambda costs: of(CauseCosts(costs, self.settings)))
+
     def _of_parameters(self) -> Explained | None:
         """Return the uncertain parameters that differ from those of M, with what is found beside them as in verdicts.
 
@@ -290,10 +307,17 @@ class _Study:
         model, plant = self.model, self.plant
         if not isinstance(model, MuJoCo) or not model.uncertain:
             return None
+        count = len(model.uncertain)
+        if not self._affords("the uncertain parameters of M", lambda costs: costs.parameters(count)):
+            return None
         commands, seconds = np.concatenate([run.inputs for run in self.runs]), max(r.times[-1] for r in self.runs)
         late = input_candidates(model, plant.dt, plant.inputs, commands, float(seconds), together=True)
         beside, rng = (*late, *further_attributes(model, self.runs)), np.random.default_rng(0)
-        found = most_probable(model, self.runs, beside, None, rng, ParameterSettings())
+        stage_of = "parameters of M from all of their prior"
+        found = most_probable(
+            model, self.runs, beside, None, rng, ParameterSettings(),
+            lambda steps: self._affords(stage_of, lambda costs: costs.costs.steps(steps)),
+        )  # fmt: skip
         if found is None:
             return None
         deviations = np.sqrt(np.diag(np.linalg.inv(found.precision)))
@@ -322,8 +346,8 @@ class _Study:
 
     def _reported(self, group: list[Explained], ranked: list[Explanation], began_elsewhere: bool) -> CauseReport:
         named = bool(group) and group[0].counts(self.before) and group[0].complete >= self.settings.named
-        is_measured = group and not self.outputs and not began_elsewhere
-        from_tasks = self.loops.distance_from_tasks(group[0].explanation.repaired) if is_measured else None
+        is_measured = group and not began_elsewhere
+        from_tasks = self._distance_from_tasks(group[0].explanation.repaired) if is_measured else None
         return CauseReport(
             plant=self.plant,
             explained=tuple(group),
@@ -419,7 +443,7 @@ class _Study:
 
     def _in_closed_loop(self, explanation: Explanation) -> Explained:
         """Return how well causes predict each execution if they are fitted to the others."""
-        noise = np.zeros(self.segments.states.shape[1]) if self.outputs else self.segments.noise(explanation.repaired)
+        noise = self._noise(explanation)
         predicted, sizes = list[Predicted](), []
         for k, (execution, others) in enumerate(zip(self.executions, self.others, strict=True)):
             fitted = explained(others, explanation.candidates, explanation.sizes, near=True)
@@ -444,6 +468,8 @@ class _Study:
     def _separating(self, group: Sequence[Explained]) -> Separating | None:
         """Return the task at which the predictions of causes that the executions do not tell apart differ most."""
         best, space = None, self.validation.space
+        if not self._affords("the task that tells causes apart", lambda costs: costs.separating(len(group))):
+            return None
         for point in space.from_unit(np.random.default_rng(0).random((24, space.dimension))):
             try:
                 plan = self.validation.plan(point)
@@ -459,6 +485,30 @@ class _Study:
                     apart = float(self.validation.distance_between(first, loop, plan.task))
                     best = Separating(space.describe_point(point), apart, number, gap)
         return best
+
+
+class _EstimatedStudy(_Study):
+    """What explains the executions of a validation whose states are estimated from outputs, and begin anywhere."""
+
+    estimated = True
+
+    def _segments_of(self, horizon: int) -> SegmentSettings:
+        return SegmentSettings((max(1, horizon // 60), max(1, horizon // 12)))  # one step of estimates is worth little
+
+    def _stops(self, following: list[Array]) -> Iterable[EffectCandidate]:
+        return ()
+
+    def _by_what_is_seen(self) -> Explained | None:
+        return super()._by_what_is_seen() if self.known else None
+
+    def _of_parameters(self) -> Explained | None:
+        return None
+
+    def _noise(self, explanation: Explanation) -> Array:
+        return np.zeros(self.segments.states.shape[1])
+
+    def _distance_from_tasks(self, repaired: ModelWithEffects) -> float | None:
+        return None
 
 
 def _is_nothing(candidate: EffectCandidate) -> bool:
