@@ -48,6 +48,9 @@ class MuJoCo:
         invariant: what the dynamics do not depend on: ``["x", "y", "yaw"]`` of the only free joint, on flat ground
             without walls, or names of hinges and slides. What M misses is then learned as a function of the other
             states, in the heading frame, and records need not cover these. If executions contradict, all states count.
+
+    Raises:
+        InputError: if dt is no multiple of the MJCF's time step.
     """
 
     uncertain: tuple[UncertainParameter, ...] = ()
