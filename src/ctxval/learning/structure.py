@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctxval._util.arrays import single_threaded
+from ctxval._util.arrays import Mask, Rows, single_threaded
 from ctxval.errors import InputError
-from ctxval.learning.dry_friction import FrictionSettings, found_friction
+from ctxval.learning.effects.dry_friction import FrictionSettings, found_friction
+from ctxval.learning.effects.effect import EffectCandidate
 from ctxval.learning.effects.inputs import InputEffects
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
@@ -25,6 +26,7 @@ from ctxval.learning.input_effects import Found, InputEffectSettings, found_effe
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.prediction import Executed
 from ctxval.learning.recorded import digest, schedule
+from ctxval.learning.settling import SettlingModel
 from ctxval.learning.stage_costs import Costs, Ledger
 from ctxval.models.corrected import before_refinement
 
@@ -81,12 +83,12 @@ class StructureSearch:
         names, single = len(plain.given.space.units) + 1, settings.input_effects.single
         friction = Part(
             "dry friction", settings.friction, Costs.friction,
-            self.with_friction, lambda study: study.friction is not None,
+            self.with_friction, lambda study: bool(study.within_steps),
         )  # fmt: skip
         self.parts = [
             Part(
                 "inputs that act late", settings.inputs, lambda costs: costs.input_effects(single),
-                self.with_inputs, lambda study: bool(study.effects),
+                self.with_inputs, lambda study: bool(study.of_inputs),
             ),
             *([] if plain.given.outputs.hide_states else [friction]),
             Part("the data of M", settings.data, Costs.learning, _without_data, lambda study: not study.with_data),
@@ -153,10 +155,10 @@ class StructureSearch:
         if before is self.plain:
             return before
         study = self.plain.made(given=before.given, with_data=before.with_data)
-        if before.effects:
-            study = self.with_inputs(study, executed, before.effects) or study
-        if before.friction is not None:
-            study = self.with_friction(study, executed) or study.made(friction=before.friction)
+        if before.of_inputs:
+            study = self.with_inputs(study, executed, before.of_inputs) or study
+        if before.within_steps:
+            study = self.with_friction(study, executed) or study.made(effects=(*study.effects, *before.within_steps))
         return study
 
     # Parts
@@ -164,8 +166,6 @@ class StructureSearch:
     def with_inputs(self, study: DynamicsStudy, executed: Executed, before: Found = ()) -> DynamicsStudy | None:
         """Return a study with the effects of inputs that executions show; those found before are the first guess."""
         given, estimated = study.given, study.given.outputs.hide_states
-        if study.friction is not None:
-            return None  # its steps at rest teach nothing of inputs that act late
         among = executed[-self.settings.estimated_from :] if estimated else executed
         commanded = [trajectory.inputs for _, trajectory in among]
         alike = len({u.shape for u in commanded}) == 1
@@ -183,16 +183,18 @@ class StructureSearch:
 
         # If states are recorded, they are the same with all effects.
         plain = [] if estimated else estimated_with(InputEffects())
-        model = before_refinement(study.validation.model)
         # If states have to be estimated each time, or with many inputs, single ones cost too much.
         together = estimated or commanded[0].shape[-1] > self.settings.input_effects.single
         candidates = study.input_candidates([trajectory for _, trajectory in among], together=together)
         with single_threaded(), np.errstate(all="ignore"):
             found = found_effects(
-                model, estimated_with if estimated else with_inputs, candidates, before,
+                study.model, estimated_with if estimated else with_inputs, candidates, before,
                 estimated=estimated, settings=self.settings.input_effects,
             )  # fmt: skip
-        return study.made(effects=found) if found else None
+        if not found:
+            return None
+        late = study.made(effects=(*found, *study.within_steps))
+        return (self.with_friction(late, executed) if study.within_steps else None) or late
 
     def with_friction(self, study: DynamicsStudy, executed: Executed) -> DynamicsStudy | None:
         """Return a study with the dry friction that executions show."""
@@ -201,11 +203,13 @@ class StructureSearch:
         friction, settings = None, self.settings.dry_friction
         with single_threaded(), np.errstate(all="ignore"), contextlib.suppress(RuntimeError):  # of the least squares
             friction = None if recorded is None else found_friction(model, recorded[0], settings)
-        return None if friction is None else study.made(friction=friction)
+        if friction is None:
+            return None
+        return study.made(effects=(*study.of_inputs, EffectCandidate(friction)))
 
 
 def _without_data(study: DynamicsStudy, executed: Executed) -> DynamicsStudy | None:
-    return study.made(with_data=False) if study.has_data and not study.effects else None
+    return study.made(with_data=False) if study.has_data and not study.of_inputs else None
 
 
 def most_telling(study: DynamicsStudy, executed: Executed) -> tuple[DynamicsStudy | None, float, float]:
@@ -231,9 +235,10 @@ def share_left(found: LearnedDynamics, without: LearnedDynamics, settings: Struc
     What the Gaussian processes take for noise is no part of them. Of dry friction, only the rates that it slows count:
     where a joint stops within a step changes its position a little, which nothing predicts.
     """
-    friction, n = found.study.friction, len(without.error_units)
-    alone = friction is not None and without.study.friction is None
-    states = friction.rates if friction is not None and alone else without.posterior.data.learned
+    model, n = found.study.model, len(without.error_units)
+    states: Rows | Mask = without.posterior.data.learned
+    if isinstance(model, SettlingModel) and not isinstance(without.study.model, SettlingModel):
+        states = model.rates
     units = without.error_units
     noise = float(((found.posterior.deviations[:n] / units)[states] ** 2).sum())
     squares, squares_without = (

@@ -10,8 +10,8 @@ import pytest
 from ctxval import Array, models
 from ctxval.core.trajectory import Transitions
 from ctxval.learning import effects
-from ctxval.learning.dry_friction import found_friction
 from ctxval.learning.effects import Joint, ModelWithEffects
+from ctxval.learning.effects.dry_friction import found_friction
 from ctxval.learning.effects.flow import Flow
 
 DT = 0.05

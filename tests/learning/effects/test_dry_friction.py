@@ -17,7 +17,7 @@ from ctxval._util.arrays import Array
 from ctxval.core.target import Largest
 from ctxval.core.trajectory import Transitions
 from ctxval.learning import DynamicsStudy
-from ctxval.learning.dry_friction import DryFriction, found_friction
+from ctxval.learning.effects.dry_friction import DryFriction, found_friction
 from facts import assert_names
 from rig_thorough import more
 
@@ -43,8 +43,11 @@ def sticky_step(
 
 def rubbing(model: models.Linear, rates: list[int], sliding: Array) -> DryFriction:
     m = len(rates)
-    sizes = sliding, *np.zeros((2, m)), np.ones(m), np.zeros(m), np.full(m, 1e-3), np.zeros(m)
-    return DryFriction(model, np.array(rates), *sizes, rest=np.stack([sliding] * 2), passed=np.full(m, np.inf))
+    sizes = tuple(np.stack([sliding, *np.zeros((2, m)), np.ones(m)], axis=1).ravel().tolist())
+    rest, passed = np.stack([sliding] * 2), np.full(m, np.inf)
+    return DryFriction(
+        sizes, model, np.array(rates), np.ones(m), np.zeros(m), np.full(m, 1e-3), np.zeros(m), rest, passed
+    )
 
 
 def recorded(step: Any, count: int = 300, inputs: int = 1) -> Transitions:
@@ -70,22 +73,24 @@ def test_what_holds_a_joint_at_rest_is_bounded_by_what_it_withstood_and_what_set
     x, inputs = np.concatenate([moving.x, still]), np.concatenate([moving.u, u])
     known = rubbing(MODEL, [1], np.array([GRIP]))
 
-    def missed(acting: Array) -> Array:
+    def missed(x: Array, acting: Array) -> Array:
         return sticky_step(x, acting, 0.0) - MODEL.step(x, acting)
 
     transitions = Transitions(x, inputs, step(x, inputs))
-    least, largest, passed, uneven = known.resting(transitions, known.pushes(transitions, missed))
-    assert (uneven == 1).all()
+    told = known.told_by(transitions, missed)
+    assert told.told is not None
+    least, largest = told.told.least, told.told.largest
+    assert (told.told.uneven == 1).all()
     # At another place, the joint withstands three times the force that moved it here.
     place = np.array([[0.8, 0.0]])
     at, pushes = np.concatenate([x, place]), np.concatenate([inputs, [[3.9]]])
     caught = Transitions(at, pushes, np.concatenate([transitions.x_next, place]))
-    pushed = known.pushes(caught, lambda acting: sticky_step(at, acting, 0.0) - MODEL.step(at, acting))
-    ratios = known.resting(caught, pushed)[3]
-    assert ratios[1, 0] == pytest.approx(3.9 / 2.0, rel=0.05)
+    elsewhere = known.told_by(caught, missed).told
+    assert elsewhere is not None
+    assert elsewhere.uneven[1, 0] == pytest.approx(3.9 / 2.0, rel=0.05)
     assert least[:, 0] == pytest.approx([1.1, GRIP], abs=0.01)
     assert largest[:, 0] == pytest.approx([1.3, 2.0], abs=0.02)
-    assert passed[0] > GRIP
+    assert told.passed[0] > GRIP
     held = replace(known, rest=np.array([[1.2], [1.2]]))
     np.testing.assert_allclose(held.following(still, u, lambda acting: 0 * still)[:2], 0.0, atol=1e-12)
     slid = DT * np.sign(u[2:, 0]) * (np.abs(u[2:, 0]) - GRIP)
@@ -195,16 +200,18 @@ def test_a_joint_that_creeps_while_it_is_held_is_found_to_do_so() -> None:
     start, push = np.array([[0.3, 0.0]]), np.array([[0.95]])
     begun = np.concatenate([x, start]), np.concatenate([u[:, None], push])
     steps = Transitions(*begun, creeping(*begun))
-    least, *_ = friction.resting(steps, friction.pushes(steps, lambda acting: np.zeros_like(begun[0])))
+    told = friction.told_by(steps, lambda x, acting: np.zeros_like(x)).told
+    assert told is not None
     assert creeping(start, push)[0, 1] < 2 * 0.006 * 0.95
-    assert least[:, 0] == pytest.approx(GRIP, rel=0.02)
+    assert told.least[:, 0] == pytest.approx(GRIP, rel=0.02)
     # A joint that begins to creep does not move yet.
     start, push = np.array([[0.3, 0.0]]), np.array([[2.0]])
     x, u = np.concatenate([x, start]), np.concatenate([u[:, None], push])
     steps = Transitions(x, u, creeping(x, u))
-    least, largest, *_ = friction.resting(steps, friction.pushes(steps, lambda acting: np.zeros_like(x)))
-    assert least[:, 0] == pytest.approx(GRIP, rel=0.02)
-    assert largest[1, 0] == pytest.approx(2.0, rel=0.05)
+    told = friction.told_by(steps, lambda x, acting: np.zeros_like(x)).told
+    assert told is not None
+    assert told.least[:, 0] == pytest.approx(GRIP, rel=0.02)
+    assert told.largest[1, 0] == pytest.approx(2.0, rel=0.05)
 
 
 def test_two_inputs_of_one_rate_have_no_friction_of_their_own() -> None:
