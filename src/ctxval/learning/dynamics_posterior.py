@@ -23,7 +23,7 @@ from ctxval.core.model import Model
 from ctxval.core.state_geometry import PLAIN, StateGeometry
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
-from ctxval.gp.cholesky import factorise, pivoted_rows
+from ctxval.gp.cholesky import CholeskyFactor, factorise, pivoted_rows
 from ctxval.learning.draws import DisturbedDynamics, DynamicsDraws, bounded
 from ctxval.learning.hyperparameters import (
     FAMILIES,
@@ -220,6 +220,11 @@ class DynamicsPosterior(ShortRepr):
         variance = most.whitened(Z.reshape(-1, Z.shape[-1]))[1].reshape(Z.shape[:2]).mean(axis=1)
         sizes = (data.sizes / data.steps)[data.learned] ** 2 * most.squares / len(most.centres)
         return np.asarray(np.sqrt(variance * (sizes.mean() if len(sizes) else 0.0)))
+
+    def prior(self, x: Array, u: Array) -> CholeskyFactor:
+        """Return the factor of the prior covariance ``(N, N)``, with noise, at states and acting inputs."""
+        most, Z = self.most_probable.hyperparameters, self.data.standardised(x, u)
+        return factorise(most.kernel(most.theta, Z, Z), most.noise, insist=True)
 
     # Draws
 

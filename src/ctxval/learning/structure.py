@@ -17,7 +17,8 @@ import numpy as np
 
 from ctxval._util.arrays import Mask, Rows, single_threaded
 from ctxval.errors import InputError
-from ctxval.learning.effects.dry_friction import FrictionSettings, found_friction
+from ctxval.learning.dynamics_posterior import DynamicsPosterior
+from ctxval.learning.effects.dry_friction import DryFriction, FrictionSettings, found_friction
 from ctxval.learning.effects.effect import EffectCandidate
 from ctxval.learning.effects.inputs import InputEffects
 from ctxval.learning.extended import ExtendedValidation
@@ -53,6 +54,7 @@ class StructureSettings:
 
     inputs: PartLimits = PartLimits(3, 0.02, 0.95)  # the evidence decides
     friction: PartLimits = PartLimits(4, 0.1, 0.5)
+    friction_beside: float = 0.95  # share, of friction that is found beside a Gaussian process: its evidence decides
     data: PartLimits = PartLimits(3, 0.1, 1 / 3, 0.1)
     parameter: PartLimits = PartLimits(6, 0.1, 1 / 3, 0.1)
     enough: float = 0.02  # left-out error below which no further part is compared
@@ -70,7 +72,9 @@ class Part:
     name: str  # as the budget of thinking names it
     limits: PartLimits
     seconds: Callable[[Costs], float]
-    add: Callable[[DynamicsStudy, Executed], DynamicsStudy | None]  # a study with it; None if it explains nothing
+    # how a study with it is made, or None if it explains nothing, and which share of errors it must leave at most:
+    # the first way that explains enough
+    ways: tuple[tuple[Callable[[DynamicsStudy, Executed], DynamicsStudy | None], float], ...]
     has: Callable[[DynamicsStudy], bool]
 
 
@@ -83,18 +87,22 @@ class StructureSearch:
         names, single = len(plain.given.space.units) + 1, settings.input_effects.single
         friction = Part(
             "dry friction", settings.friction, Costs.friction,
-            self.with_friction, lambda study: bool(study.within_steps),
+            ((self.with_friction, settings.friction.share), (self.with_friction_beside, settings.friction_beside)),
+            lambda study: bool(study.within_steps),
         )  # fmt: skip
         self.parts = [
             Part(
                 "inputs that act late", settings.inputs, lambda costs: costs.input_effects(single),
-                self.with_inputs, lambda study: bool(study.of_inputs),
+                ((self.with_inputs, settings.inputs.share),), lambda study: bool(study.of_inputs),
             ),
             *([] if plain.given.outputs.hide_states else [friction]),
-            Part("the data of M", settings.data, Costs.learning, _without_data, lambda study: not study.with_data),
+            Part(
+                "the data of M", settings.data, Costs.learning,
+                ((_without_data, settings.data.share),), lambda study: not study.with_data,
+            ),
             Part(
                 "parameters that change the dynamics", settings.parameter, lambda costs: names * costs.learning(),
-                lambda study, executed: most_telling(study, executed)[0],
+                ((lambda study, executed: most_telling(study, executed)[0], settings.parameter.share),),
                 lambda study: len(study.given.physical) > len(plain.given.physical),
             ),
         ]  # fmt: skip
@@ -135,15 +143,15 @@ class StructureSearch:
                 limits = part.limits
                 if part.has(study) or len(executed) < limits.after or not learned.left_out_error > limits.error:
                     continue
-                tried = part.add(study, executed)
-                found = None if tried is None else tried.learned_alone(executed)
-                if found is None:
-                    continue
-                left = share_left(found, learned, self.settings)
-                if left < limits.share and found.left_out_error < limits.most and (best is None or left < best[0]):
-                    best = left, found
-                    if found.left_out_error < self.settings.enough:
+                for add, share in part.ways:
+                    tried = add(study, executed)
+                    found = None if tried is None else tried.learned_alone(executed)
+                    left = np.inf if found is None else share_left(found, learned, self.settings)
+                    if found is not None and left < share and found.left_out_error < limits.most:
+                        best = (left, found) if best is None or left < best[0] else best
                         break
+                if best is not None and best[1].left_out_error < self.settings.enough:
+                    break
             if best is None:
                 break
             learned = best[1]
@@ -158,7 +166,7 @@ class StructureSearch:
         if before.of_inputs:
             study = self.with_inputs(study, executed, before.of_inputs) or study
         if before.within_steps:
-            study = self.with_friction(study, executed) or study.made(effects=(*study.effects, *before.within_steps))
+            study = self._with_friction_again(study, executed, before.within_steps)
         return study
 
     # Parts
@@ -193,16 +201,31 @@ class StructureSearch:
             )  # fmt: skip
         if not found:
             return None
-        late = study.made(effects=(*found, *study.within_steps))
-        return (self.with_friction(late, executed) if study.within_steps else None) or late
+        late = study.made(effects=found)
+        return self._with_friction_again(late, executed, study.within_steps) if study.within_steps else late
 
-    def with_friction(self, study: DynamicsStudy, executed: Executed) -> DynamicsStudy | None:
-        """Return a study with the dry friction that executions show."""
+    def _with_friction_again(self, study: DynamicsStudy, executed: Executed, before: Found) -> DynamicsStudy:
+        """Return a study with dry friction as it was found before, with sizes for these executions."""
+        beside = any(isinstance(each.effect, DryFriction) and each.effect.beside_process for each in before)
+        found = (self.with_friction_beside if beside else self.with_friction)(study, executed)
+        return found or study.made(effects=(*study.effects, *before))
+
+    def with_friction_beside(self, study: DynamicsStudy, executed: Executed) -> DynamicsStudy | None:
+        """Return a study with the dry friction that executions show beside the smooth part that was learned of them."""
+        learned = study.made(effects=study.of_inputs).learned_alone(executed)
+        return None if learned is None else self.with_friction(study, executed, learned.posterior)
+
+    def with_friction(
+        self, study: DynamicsStudy, executed: Executed, beside: DynamicsPosterior | None = None
+    ) -> DynamicsStudy | None:
+        """Return a study with the dry friction that executions show, beside a linear function or a given process."""
         extended, model = study.extended.executions(executed), before_refinement(study.validation.model)
         recorded = study.transitions_of(extended, with_data=False) if extended else None
         friction, settings = None, self.settings.dry_friction
-        with single_threaded(), np.errstate(all="ignore"), contextlib.suppress(RuntimeError):  # of the least squares
-            friction = None if recorded is None else found_friction(model, recorded[0], settings)
+        prior = None if beside is None else beside.prior
+        # Least squares may fail, and so may the factor of a covariance.
+        with single_threaded(), np.errstate(all="ignore"), contextlib.suppress(RuntimeError, InputError):
+            friction = None if recorded is None else found_friction(model, recorded[0], settings, prior)
         if friction is None:
             return None
         return study.made(effects=(*study.of_inputs, EffectCandidate(friction)))

@@ -17,6 +17,7 @@ from ctxval._util.arrays import Array
 from ctxval.core.target import Largest
 from ctxval.core.trajectory import Transitions
 from ctxval.learning import DynamicsStudy
+from ctxval.learning.effects import Delay, ModelWithEffects
 from ctxval.learning.effects.dry_friction import DryFriction, found_friction
 from facts import assert_names
 from rig_thorough import more
@@ -121,6 +122,17 @@ def test_its_size_is_in_units_of_the_input_if_the_model_errs_in_what_an_input_do
     friction = found_friction(weak, recorded(sticky_step))
     assert friction is not None
     assert friction.sliding[0] == pytest.approx(GRIP, rel=0.02)
+
+
+def test_it_is_found_at_an_input_that_drives_its_joint_backwards() -> None:
+    backwards, steps = models.Linear(MODEL.A, -MODEL.B), recorded(lambda x, u: sticky_step(x, -u))
+    friction = found_friction(backwards, steps)
+    assert friction is not None
+    assert friction.sliding[0] == pytest.approx(GRIP, rel=0.02)
+    there, moving = friction.teaching(steps)
+    left = there.x_next - backwards.step(there.x, there.u)
+    np.testing.assert_allclose(left[moving, 1], -DT * 0.3 * steps.x[moving, 1], atol=0.02)  # drag alone
+    assert np.abs(friction.step(np.zeros((2, 2)), np.array([[0.7], [-0.7]]))[:, 1]).max() < 1e-12
 
 
 @pytest.mark.parametrize("excess", [0.0, 0.4])
@@ -256,6 +268,26 @@ def test_runs_that_stop_short_are_predicted_from_few_executions(
     assert learned.noisy is None  # what friction does within a step is no history
     expected, distances_ = learned.expected(points[count:]), [run.distance for run in runs[count:]]
     np.testing.assert_allclose(expected, distances_, rtol=0, atol=0.05 * max(distances_))
+
+
+def test_friction_and_a_delay_are_found_together_in_any_order() -> None:
+    late = ModelWithEffects(models.Function(sticky_step, vectorized=True), (Delay((2.0,)),), 1)
+    validation = cart().with_parts(system=late)
+    points = np.random.default_rng(0).random((10, 2))
+    runs = [validation.outcome(validation.space.from_unit(point)) for point in points]
+    executed = [(point, run.system_trajectory) for point, run in zip(points[:6], runs, strict=False)]
+    study = DynamicsStudy(validation)
+    learned = study.learn(executed)
+    assert learned is not None
+    assert learned.acting == pytest.approx({"delay [steps]": 2.0}, rel=0.05)
+    assert learned.friction["u[0]"] == pytest.approx(GRIP, rel=0.1)
+    expected, distances_ = learned.expected(points[6:]), [run.distance for run in runs[6:]]
+    np.testing.assert_allclose(expected, distances_, rtol=0, atol=0.1 * max(distances_))
+    within = study.made(effects=learned.study.within_steps)
+    both = study.structures.with_inputs(within, executed)
+    assert both is not None
+    assert [type(each.effect) for each in both.effects] == [Delay, DryFriction]
+    assert both.effects[0].effect.sizes == pytest.approx((2.0,), rel=0.05)
 
 
 @pytest.mark.thorough

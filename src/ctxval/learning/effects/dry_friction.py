@@ -24,6 +24,7 @@ import scipy
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
+from ctxval.gp.cholesky import CholeskyFactor
 from ctxval.learning.effects.effect import Effect
 from ctxval.learning.settling import SettlingModel
 from ctxval.models.increments import standard_deviations
@@ -37,8 +38,10 @@ class FrictionSettings:
     """
 
     explained: float = 0.7  # share of the squared residuals, beside a linear function, that must be left at most
+    explained_beside: float = 0.5  # the same, beside a Gaussian process
     better_shape: float = 0.5  # the same, if friction has one more shape
     per_coefficient: int = 5  # fewest recorded steps for each coefficient of the linear function
+    most: int = 400  # recorded steps beside a Gaussian process
     varied: float = 0.1  # least share of the squares of inputs that no linear function of the state has
     at_rest: float = 0.05  # share of a rate below which the joint is at rest
     held: float = 0.2  # share of at_rest below which a joint is held; one that stops is faster
@@ -99,6 +102,7 @@ class DryFriction(Effect, SettlingModel):
     rest: Array  # the largest friction at rest against pushes below and above 0 (2, m), or of draws (S, 1, 2, m)
     passed: Array  # the largest friction that holds a joint as it turns (m,)
     settings: FrictionSettings = FrictionSettings()
+    beside_process: bool = False  # whether it was found beside a Gaussian process, and not a linear function
     told: AtRest | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -246,11 +250,15 @@ class DryFriction(Effect, SettlingModel):
 
 
 def found_friction(
-    model: Model, transitions: Transitions, settings: FrictionSettings = FrictionSettings()
+    model: Model,
+    transitions: Transitions,
+    settings: FrictionSettings = FrictionSettings(),
+    prior: Callable[[Array, Array], CholeskyFactor] | None = None,
 ) -> DryFriction | None:
     """Return M with the friction that explains transitions best; None if friction does not explain much of them.
 
-    It is estimated beside a linear function of state and input and drag, because M may be wrong in other ways, too.
+    It is estimated beside a linear function of state and input and drag, because M may be wrong in other ways, too; or
+    beside a Gaussian process whose ``prior`` at states and inputs ``(N, N)`` is given.
     """
     x, u = transitions.x, transitions.u
     ranges = np.abs(u).max(axis=0, initial=0.0)
@@ -261,7 +269,9 @@ def found_friction(
     rates = strength.argmax(axis=0)
     signs = np.where(effects.mean(axis=0)[rates, np.arange(len(rates))] < 0, -1.0, 1.0)
     directions = _directions(transitions, rates, settings) * signs
-    moving = (directions != 0).all(axis=1)
+    moving = np.flatnonzero((directions != 0).all(axis=1))
+    if prior is not None:
+        moving = moving[:: -(-len(moving) // settings.most) or 1]
     usual = np.sqrt((transitions.x_next[:, rates] ** 2).mean(axis=0))
     fast = x[:, rates] / np.maximum(usual, 1e-300)
     plain = [np.ones(len(x)), x / standard_deviations(x)]
@@ -277,7 +287,14 @@ def found_friction(
     linear, by_state = np.linalg.qr(features)[0], np.linalg.qr(features[:, :-m])[0]
     # Under feedback with fixed gains, what inputs change cannot be told from what states do.
     known = ((_beside(by_state, inputs) ** 2).sum(axis=0) > settings.varied * (inputs**2).sum(axis=0)).all()
-    left = _beside(linear, residuals / sizes)
+    factor = None if prior is None else prior(x[moving], u[moving])
+
+    def beside(values: Array) -> Array:
+        if factor is None:
+            return _beside(linear, values)
+        return factor.whiten(values.reshape(len(values), -1)).reshape(values.shape)
+
+    left = beside(residuals / sizes)
 
     def fitted(shapes: Sequence[Array]) -> tuple[float, Array]:
         """Return what is left if friction has some shapes ``(N, m)``, and the sizes of each at each input."""
@@ -286,7 +303,7 @@ def found_friction(
             """Return forces, their sizes and what is left, if inputs change rates by ``acting`` ``(N, m, m)``."""
             forces = np.concatenate([-acting * shape[:, None, :] for shape in shapes], axis=2)
             largest, norm = scipy.optimize.nnls(
-                _beside(linear, forces / sizes[:, None]).reshape(-1, forces.shape[2]), left.ravel()
+                beside(forces / sizes[:, None]).reshape(-1, forces.shape[2]), left.ravel()
             )
             return forces, largest, float(norm)
 
@@ -300,7 +317,7 @@ def found_friction(
 
     moves = directions[moving]
     left_over, largest = fitted([moves])
-    if not left_over**2 < settings.explained * (left**2).sum():
+    if not left_over**2 < (settings.explained if factor is None else settings.explained_beside) * (left**2).sum():
         return None
     shapes = [moves, moves * np.abs(u[moving])]
     loaded, by_load = fitted(shapes)
@@ -326,6 +343,7 @@ def found_friction(
         rest=np.stack([largest[0] + excess] * 2),
         passed=np.full(m, np.inf),
         settings=settings,
+        beside_process=factor is not None,
     )
 
 
