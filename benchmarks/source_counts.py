@@ -3,6 +3,9 @@
 ``python benchmarks/source_counts.py 6387a59`` prints those of a revision beside those of this checkout. Lines are all
 lines of Python files; lines of docstrings and comments are among them.
 
+Branches on suites, outputs and quantiles are conditions, and operands of ``and``, ``or`` and ``not``, that ask for the
+truth of a value of one of these names, or whether it is None.
+
 Assertions on sentences are the texts with more than two words of prose that tests compare with: operands in ``assert``,
 the argument ``match``, and facts of ``tests/facts.py``. Those of parametrised tests and of loops count once each.
 """
@@ -132,6 +135,36 @@ def numeric_constants(text: str) -> list[str]:
     return names
 
 
+BRANCHING = {"suite", "outputs", "quantile"}
+
+
+def _last_name(node: ast.expr) -> str:
+    match node:
+        case ast.NamedExpr(value=value):
+            return _last_name(value)
+        case ast.Attribute(attr=name) | ast.Name(id=name):
+            return name.lstrip("_")
+        case ast.Subscript(slice=ast.Constant(value=str(name))) | ast.Call(args=[ast.Constant(value=str(name)), *_]):
+            return name
+    return ""
+
+
+def branches(nodes: list[ast.AST]) -> int:
+    """Return how many conditions ask whether there is a suite, outputs or a quantile."""
+    tested = list[ast.expr]()
+    for node in nodes:
+        match node:
+            case ast.If(test=test) | ast.IfExp(test=test) | ast.While(test=test) | ast.Assert(test=test):
+                tested.append(test)
+            case ast.comprehension(ifs=parts) | ast.BoolOp(values=parts):
+                tested += parts
+            case ast.UnaryOp(op=ast.Not(), operand=operand):
+                tested.append(operand)
+            case ast.Compare(left=left, ops=[ast.Is() | ast.IsNot()]):
+                tested.append(left)
+    return len({id(each) for each in tested if _last_name(each) in BRANCHING})
+
+
 def counts(source: Path) -> dict[str, float]:
     """Return all counts of the package in a folder ``src``."""
     texts = [path.read_text() for path in sorted(source.rglob("*.py"))]
@@ -146,6 +179,7 @@ def counts(source: Path) -> dict[str, float]:
         "files": len(texts),
         "functions": len(functions),
         "lines of a function, mean": round(statistics.mean(lengths), 1),
+        "branches on suite, outputs, quantile": branches(nodes),
         "numeric module constants": sum(len(numeric_constants(text)) for text in texts),
         **{name: sum(len(re.findall(pattern, text, re.M)) for text in texts) for name, pattern in PATTERNS.items()},
     }

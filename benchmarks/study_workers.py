@@ -40,7 +40,7 @@ from ctxval import (
 from ctxval._util.arrays import Array, single_threaded
 from ctxval.campaign.choices import Choice, Execution
 from ctxval.campaign.execution import ExecutionLoop
-from ctxval.campaign.interval_search import IntervalSearch
+from ctxval.campaign.suite_intervals import interval_search
 from ctxval.campaign.workers import WorkerPool, execute_task
 from ctxval.certificates import CertificateOptions
 from ctxval.core.plan import Plan
@@ -215,7 +215,7 @@ def study(one: tuple[str, str, int, int]) -> dict[str, Any]:
         recorder, pool = campaign.recorder, SimulatedPool(validation.system, workers, seed)
         decides = None
         if mode == "decide":
-            decides = IntervalSearch(recorder, CertificateOptions.or_automatic(None, 0.95, 0.1), 1000, within=WITHIN)
+            decides = interval_search(recorder, CertificateOptions.or_automatic(None, 0.95, 0.1), 1000, within=WITHIN)
 
         def rule() -> Choice | None:
             over = pool.now >= LONGEST or len(ended) + len(recorder.executing) >= MOST

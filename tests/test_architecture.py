@@ -13,7 +13,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-from source_counts import counts_of_tests, numeric_constants, sentence_assertions
+from source_counts import branches, counts_of_tests, numeric_constants, sentence_assertions
 
 SOURCE = Path(__file__).parents[1] / "src" / "ctxval"
 ARCHITECTURE = Path(__file__).parents[1] / "docs" / "architecture.md"
@@ -36,6 +36,7 @@ CONTROL = {
 SENTENCES = 80
 """Assertions on wording: texts have their snapshots, everything else asserts names, values and codes."""
 CONSTANTS = 120  # numbers in capitals that are no settings: tolerances of rounding, formats, layouts; never more
+BRANCHES = 20  # conditions on a suite, outputs or a quantile: task spaces, outputs and targets answer in their place
 READ_ONLY = ("report",)
 EXECUTING = {"execute", "run", "ask", "tell", "outcome", "distances", "plan"}
 
@@ -166,6 +167,12 @@ def test_tasks_validations_and_stores_are_there_without_the_parts_of_scipy() -> 
 
 def test_numbers_that_decide_are_settings() -> None:
     assert sum(len(numeric_constants(path.read_text())) for path in SOURCE.rglob("*.py")) <= CONSTANTS
+
+
+def test_task_spaces_outputs_and_targets_answer_in_the_place_of_branches() -> None:
+    assert sum(branches(list(ast.walk(ast.parse(path.read_text())))) for path in SOURCE.rglob("*.py")) <= BRANCHES
+    text = "if self._suite is None and not outputs:\n    x = [y for y in z if d.get('quantile')] or details['quantile']"
+    assert branches(list(ast.walk(ast.parse(text)))) == 4
 
 
 def test_tests_assert_facts_and_hardly_any_sentence() -> None:

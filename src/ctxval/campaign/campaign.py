@@ -32,9 +32,9 @@ from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.executors import Executor, worker_pool
 from ctxval.campaign.history import executed_trials
 from ctxval.campaign.identity import identify, search_of
-from ctxval.campaign.interval_search import IntervalSearch, with_next_task
 from ctxval.campaign.storage.other_stores import provenance_of_store
 from ctxval.campaign.storage.store import Store
+from ctxval.campaign.suite_intervals import interval_search, with_next_task
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.watching import FALSE_ALARMS, Watch
 from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Provenance, Verdict, assess, judge
@@ -264,7 +264,7 @@ class Campaign:
         options = CertificateOptions.or_automatic(certificate, confidence, resolution, share)
         if explore is None:
             explore = threshold is None and not isinstance(self.search, Auto)
-        decides = None if explore else IntervalSearch(self.recorder, options, budget, threshold, within)
+        decides = None if explore else interval_search(self.recorder, options, budget, threshold, within)
         if envelope and (decides is None or threshold is None):
             raise InputError("an envelope needs a threshold, and a campaign that does not explore.")
         enlarges = EnvelopeSearch(decides) if envelope and decides is not None else None
@@ -408,7 +408,7 @@ class Campaign:
         options = CertificateOptions.or_automatic(certificate, confidence, resolution)
         with progress_shown(progress), self.store.sole_writer(wait):
             self.refresh()
-            search = IntervalSearch(self.recorder, options, budget, threshold)
+            search = interval_search(self.recorder, options, budget, threshold)
             self.state_threshold(threshold)
             with self.recorder.predicting(search.predicts, thinking):
                 choice = search.choose() if self.executions + len(self.trials.open) < budget else None
@@ -679,7 +679,7 @@ class Campaign:
             CertificateError: if the confidence needs too many posterior samples.
         """
         options = CertificateOptions.or_automatic(certificate, confidence, RESOLUTION)
-        search = EnvelopeSearch(IntervalSearch(self.recorder, options, self.executions + 1, threshold, keeps=False))
+        search = EnvelopeSearch(interval_search(self.recorder, options, self.executions + 1, threshold, keeps=False))
         with progress_shown(progress):
             return search.envelope()
 

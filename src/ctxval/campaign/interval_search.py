@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -20,11 +21,12 @@ from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.next_task import CandidateFilter, next_task
 from ctxval.campaign.proposals import DesignContinuity, spread_tests
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.certificates import CertificateOptions, Evidence, Learned, Sample, StoppingRule, Verdict
+from ctxval.certificates import CertificateOptions, Evidence, Sample, StoppingRule
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic, WholeSuite
+from ctxval.certificates.base import CertificateKind
 from ctxval.certificates.bets import bets_against
-from ctxval.certificates.bounds import Quantities, with_units
+from ctxval.certificates.bounds import Quantities
 from ctxval.certificates.checks import Remedy, open_checks, remedies
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
@@ -33,12 +35,12 @@ from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import DistanceBound
 from ctxval.certificates.prediction_tests import DRAWN, HYPERCUBE, MANY, TESTS, hypercube_in
 from ctxval.certificates.predictions import missing_tests, mostly_fail
-from ctxval.certificates.remaining import RemainingTasks
 from ctxval.certificates.task_share import PREDICTED_ABOVE, bet_on
 from ctxval.certificates.verdict import counterexample, require_possible
 from ctxval.core.target import Target
 from ctxval.core.trial import Trial, Trials
 from ctxval.errors import CertificateError, InputError
+from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.share_search import ShareSearch
 from ctxval.learning.worst_case import is_kinked
 
@@ -147,14 +149,7 @@ class IntervalSearch:
         return self._by_distance() if evidence is None or self._fails(evidence) else self._by_dynamics(evidence)
 
     def _repeats_suffice(self) -> bool:
-        """Return whether the tasks of a suite were executed so often that a quantile of each keeps the limit."""
-        space, trials = self.recorder.validation.space, self.recorder.trials.ended
-        if space.repeats == 1 or not trials:
-            return False
-        sample = replace(Sample.of(trials), suite=space.members, repeats=space.repeats)
-        with suppress(CertificateError):
-            whole = WholeSuite(self.options.kind.quantile).certify(sample, self.options.confidence)
-            return whole.covers(self.limit)
+        """Return whether repeated executions of each task keep the limit; in a box, no task is repeated for that."""
         return False
 
     def test(self) -> Choice:
@@ -162,8 +157,6 @@ class IntervalSearch:
         trials = self.recorder.trials
         # A hypercube that was begun is completed, because what a part of it shows must not decide that it is left.
         number, row = divmod(spread_tests(trials), TESTS)
-        if self._suite is not None:
-            return Choice.tested(self.recorder.draws.hypercube(number)[row], "spread")
         if (self.tests >= MANY or self._target.by_draws) and not row:
             return Choice.tested(self.recorder.draw(), "iid")
         if row:
@@ -195,7 +188,7 @@ class IntervalSearch:
 
     def _against_noise(self) -> Choice | None:
         """Return a task whose execution tells whether noise explains a distance above the limit, if there is one."""
-        if self._suite is not None or self._target.by_draws or not self.predicts:
+        if self._target.by_draws or not self.predicts:
             return None
         trials, quantile = self.recorder.trials, self._target.quantile
         bets = bets_against(trials, self.limit, quantile)
@@ -229,9 +222,7 @@ class IntervalSearch:
 
     def _by_distance(self) -> Choice | None:
         """Return the task that the posterior bound of the distance needs; None if it decides."""
-        kind = self.options.kind.without_dynamics(self._target, self._suite)
-        if isinstance(kind, WholeSuite) and isinstance(self.options.kind, Automatic):
-            return self._by_law(kind)
+        kind = self._without_dynamics
         # It does not bound a share of the tasks, no distance is known, all are 0, or each task of a suite is executed.
         if not isinstance(kind, DistanceBound) or not self.limit > 0:
             return self.test() if self._target.by_draws and self.recorder.trials else Choice(planned_draws=0)
@@ -243,24 +234,6 @@ class IntervalSearch:
             return Choice(now.next_point, "covering", planned_draws=0, rejected=rejected)
         asked, sample = self.options.kind, Sample.of(self.recorder.trials.ended)
         return self.test() if isinstance(asked, Automatic) and asked.missing_tests(sample) else None
-
-    def _by_law(self, kind: WholeSuite) -> Choice | None:
-        """Return the task that a law of the distances of a suite needs; None if it decides, or learned dynamics may."""
-        recorder, trials = self.recorder, self.recorder.trials
-        searched = Choice(planned_draws=0)
-        if trials.in_state("failed") or len(trials.ended) <= LIMITS.freedom or not self.limit > 0:
-            return searched
-        learned = Learned(suite=recorder.dynamics.runs_of_suite(trials))
-        suite, repeats = self._suite, recorder.validation.space.repeats
-        sample = replace(Sample.of(trials.ended), suite=suite, repeats=repeats, learned=learned)
-        left = RemainingTasks(sample, kind.tests)
-        if not left.can_be_bounded or suite is None:
-            return searched
-        if kind.certify(sample, self.options.confidence).covers(self.limit):
-            decides = recorder.dynamics.evidence(trials, self.options.confidence, keep=self.keeps) is None
-            return None if decides else searched
-        row = left.next_row(self.limit)
-        return Choice.tested(recorder.draws.left(trials), "spread") if row is None else Choice.tested(suite[row])
 
     def _by_dynamics(self, evidence: Evidence) -> Choice | None:
         """Return the task that the learned dynamics need, or that the posterior bound needs; None if one decides."""
@@ -274,14 +247,14 @@ class IntervalSearch:
             decides = not open_checks(evidence)
         if decides:
             whole = dynamics.evidence(trials, confidence, keep=self.keeps)
-            if whole is None:  # more executions do not help if time is short
-                return None if dynamics.shortage is not None and self._suite is None else self._by_distance()
+            if whole is None:
+                return self._by_distance() if dynamics.shortage is None else self._if_time_is_short()
             evidence = self._asked(whole)
             with suppress(CertificateError):
                 sample = replace(Sample.of(trials.ended), threshold=self.limit)
                 if certify_dynamics(sample, evidence).covers(self.limit, self.options.left_out):
                     return None
-        remedy = self._first_remedy(evidence)
+        remedy = next(iter(self._usable(evidence)), Remedy())
         if remedy.kind == "again":
             return Choice.tested(remedy.tasks[0][0])
         if remedy.kind == "drawn above" and (above := self._above(self.limit)) is not None:
@@ -289,7 +262,7 @@ class IntervalSearch:
         # For `auto`, the posterior bound of the distance is tried after many executions, besides tests, that decided
         # nothing, and earlier if they cover the tasks, as they soon do in few dimensions.
         lacks_tests = remedy.kind == "drawn"
-        by_distances = kind.without_dynamics(evidence.target, self._suite)
+        by_distances = kind.without_dynamics(evidence.target, self.recorder.validation.space.members)
         if isinstance(by_distances, DistanceBound):
             chosen = sum(trial.origin not in DRAWN for trial in trials)
             in_places = any(opened.code in ("unvisited_region", "untested_rest") for opened in open_checks(evidence))
@@ -303,10 +276,14 @@ class IntervalSearch:
         with ledger.spending("loops"):
             return self.test() if lacks_tests else self._by_evidence(evidence)
 
-    def _first_remedy(self, evidence: Evidence) -> Remedy:
-        """Return what the first open check needs that an execution can close; tasks of a suite are executed once."""
-        usable = (each for each in remedies(evidence, len(self._known)) if "drawn" in each.kind or len(each.tasks))
-        return next((each for each in usable if self._suite is None or each.kind != "again"), Remedy())
+    def _if_time_is_short(self) -> Choice | None:
+        """Return the choice if there is no time for the bound; more executions do not help."""
+        return None
+
+    def _usable(self, evidence: Evidence) -> list[Remedy]:
+        """Return what the open checks need that an execution can close."""
+        found = remedies(evidence, len(self._known))
+        return [each for each in found if "drawn" in each.kind or len(each.tasks)]
 
     def _above(self, threshold: float) -> Choice | None:
         """Return one of new random tasks whose predicted distance exceeds a threshold, for a bet; None without one."""
@@ -328,11 +305,7 @@ class IntervalSearch:
         trials, known, waiting = self.recorder.trials, self._known, self._points(self.recorder.trials.open)
         learned = self.recorder.dynamics.learned(trials)
         steady = DesignContinuity(self.recorder.dynamics.study.planner, None if learned is None else learned.expected)
-        new = CandidateFilter(self._near, steady)
-        # Tasks that differ in parameters that change no prediction are one task, with values that are spread.
-        if learned is not None and self._suite is None:
-            moved = learned.spread_unseen, learned.seen_parameters, learned.at_untested_rest
-            new = CandidateFilter(self._near, steady, *moved)
+        new = CandidateFilter(self._near, steady, *self._moving(learned))
         point = next_task(evidence, known, new)
         if len(waiting) and (point is None or np.abs(waiting - point)[:, new.seen].max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.
@@ -386,8 +359,13 @@ class IntervalSearch:
         return self.options.kind.target
 
     @property
-    def _suite(self) -> Array | None:
-        return self.recorder.validation.space.members
+    def _without_dynamics(self) -> CertificateKind:
+        """The kind that judges by distances alone."""
+        return self.options.kind.without_dynamics(self._target, self.recorder.validation.space.members)
+
+    def _moving(self, learned: LearnedDynamics | None) -> tuple[Any, ...]:
+        """Return how new tasks are moved: those that differ only in parameters that change no prediction are one."""
+        return () if learned is None else (learned.spread_unseen, learned.seen_parameters, learned.at_untested_rest)
 
     def _points(self, trials: Iterable[Trial]) -> Array:
         return Trials(trials).points(self.recorder.validation.space.dimension)
@@ -415,22 +393,3 @@ def require_decisive(options: CertificateOptions) -> None:
         )
     if isinstance(kind, AnytimeAudit) and not options.volume:
         raise InputError("a verdict by an anytime audit needs the volume that may exceed the threshold.")
-
-
-def with_next_task(verdict: Verdict, recorder: TrialRecorder, options: CertificateOptions) -> Verdict:
-    """Return a verdict; if it is undecided and learned dynamics choose the next task, with this task."""
-    if verdict.answer != "undecided" or recorder.trials.in_state("failed") or not is_decisive(options):
-        return verdict
-    search = IntervalSearch(recorder, options, recorder.trials.executions + 1, verdict.threshold, keeps=False)
-    evidence = search._evidence()
-    choice = None if evidence is None or search._fails(evidence) else search.choose()
-    if choice is None or choice.unit_point is None:
-        return verdict
-    space = recorder.validation.space
-    point = space.from_unit(space.rounded(choice.unit_point))
-    task, learned = with_units(space.labelled(point)), recorder.dynamics.learned(recorder.trials)
-    far = SEARCH.far * max(search.best, search.limit)
-    if learned is not None and not learned.expected(choice.unit_point[None])[0] <= far:
-        task = f"(caution: its predicted run goes far beyond all others; be ready to stop it) {task}"
-    reason = f"{verdict.reason.removesuffix('.')}; next task: {task}."
-    return replace(verdict, reason=reason, next_task=space.describe_point(point))

@@ -54,15 +54,13 @@ class WholeSuite(CertificateKind):
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the certificate; the largest executed distance is the largest of all."""
-        missing = sample.not_executed
-        if missing is None:
-            raise CertificateError("tasks fill a box here, so they cannot all be executed; this kind is for a suite.")
+        members, missing = sample.members, sample.not_executed
         left = RemainingTasks(sample, self.tests)
         if missing and left.can_be_bounded:
             return self._of_remaining(left, confidence)
         if missing:
             raise CertificateError(
-                f"{missing} of {counted(sample.tasks or 0, 'task')} of the suite have no distance yet, so the largest "
+                f"{missing} of {counted(len(members), 'task')} of the suite have no distance yet, so the largest "
                 "one is not known; `ctxval run` executes them."
             )
         if sample.repeats > 1:
@@ -87,7 +85,7 @@ class WholeSuite(CertificateKind):
         }
         return self.certificate(
             sample,
-            suite_statement(h, confidence, sample.tasks or 0, missing),
+            suite_statement(h, confidence, len(sample.members), missing),
             h,
             confidence,
             (LAW_OF_DISTANCES, EXECUTED_AGAIN),
@@ -97,9 +95,8 @@ class WholeSuite(CertificateKind):
 
     def _of_repeats(self, sample: Sample, confidence: float) -> Certificate:
         """Return the bound by order statistics: how many of n executions lie below a quantile is binomial."""
-        assert sample.suite is not None
-        doubtful, known = (1 - confidence) / len(sample.suite), np.isfinite(sample.distances)
-        same = np.abs(sample.points[known][:, None] - sample.suite).max(axis=-1) <= SAME
+        doubtful, known = (1 - confidence) / len(sample.members), np.isfinite(sample.distances)
+        same = np.abs(sample.points[known][:, None] - sample.members).max(axis=-1) <= SAME
         repeats = [np.sort(sample.distances[known][of_task]) for of_task in same.T]
         fewest, q = min(map(len, repeats)), self.quantile
         needed = int(np.ceil(np.log(doubtful) / np.log(q)))
@@ -167,7 +164,7 @@ class Automatic(CertificateKind):
         if sample.learned is not None and self.needs_evidence(sample):
             with suppress(CertificateError):
                 by_dynamics = Dynamics(self.tests, self.quantile, self.share).certify(sample, confidence)
-                if by_dynamics.details["quantile"] is not None or _decides(by_dynamics, threshold):
+                if by_dynamics.target.is_noisy or _decides(by_dynamics, threshold):
                     return by_dynamics  # the posterior bound of the distance is about systems without noise
         if not isinstance(other, DistanceBound):
             return by_dynamics or other.certify(sample, confidence)

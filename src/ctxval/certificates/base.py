@@ -52,6 +52,11 @@ class Certificate:
         usable = self.doubt is None and not self.volume and math.isfinite(self.upper_bound)
         return self.upper_bound if usable else None
 
+    @property
+    def target(self) -> Target:
+        """What it bounds: the largest distance, or a quantile of executions, or the distance of a share of tasks."""
+        return Target.from_json(self.details)
+
     def covers(self, threshold: float, volume: float = 0.0) -> bool:
         """Return whether it bounds the distance by the threshold, except on at most this share of the task space.
 

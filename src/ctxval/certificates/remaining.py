@@ -88,8 +88,7 @@ class RemainingTasks(ShortRepr):
     @cached_property
     def _same(self) -> Mask:
         """Which task of the suite ``(N, n)`` is that of a trial."""
-        assert self.sample.suite is not None
-        return np.asarray(np.abs(self.sample.suite[:, None] - self.sample.points).max(axis=2) <= SAME)
+        return np.asarray(np.abs(self.sample.members[:, None] - self.sample.points).max(axis=2) <= SAME)
 
     @cached_property
     def rows(self) -> Rows:

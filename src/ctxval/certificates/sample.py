@@ -139,6 +139,13 @@ class Sample(ShortRepr):
         return replace(self, origins=origins)
 
     @property
+    def members(self) -> Array:
+        """The tasks of the suite, points of the unit cube ``(N, d)``; a CertificateError is raised without one."""
+        if self.suite is None:
+            raise CertificateError("tasks fill a box here, so they cannot all be executed; this kind is for a suite.")
+        return self.suite
+
+    @property
     def tasks(self) -> int | None:
         """The number of tasks of the suite; None if tasks fill the box."""
         return None if self.suite is None else len(self.suite)

@@ -15,8 +15,8 @@ from ctxval import Campaign, Experiment, Verdict
 from ctxval._util.progress import also_listening
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.texts import reason_of
-from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.storage.other_stores import other_stores
+from ctxval.campaign.suite_intervals import interval_search
 from ctxval.certificates import Certificate
 from ctxval.certificates.envelope import Envelope
 from ctxval.cli import base
@@ -211,7 +211,7 @@ def _live_page(parts: tuple[Any, ...], settings: ExperimentSettings) -> Iterator
     served = ServedCampaign(*parts)
     if not settings.explores:
         ending = served.budget, served.threshold, settings.within
-        search = IntervalSearch(served.campaign.recorder, served.certificate, *ending)
+        search = interval_search(served.campaign.recorder, served.certificate, *ending)
     page = web.LiveCampaign(served, search)
     with web.showing(page) as address, also_listening(page.hear):
         (err if out.quiet else out).say(f"the page is at {address}")

@@ -238,6 +238,15 @@ class TaskSpace:
         """Return the members that may follow executions at points ``(n, d)``; None if tasks fill the box."""
         return None
 
+    def are_executed(self, known: Array) -> bool:
+        """Return whether executions at points ``(n, d)`` of the unit cube are of all tasks."""
+        return False
+
+    @property
+    def axes(self) -> int:
+        """The number of parameters along which a distance is drawn: 0 in a suite, which has no tasks between its."""
+        return self.dimension
+
     def near(self, change: float) -> float:
         """Return the largest change of each coordinate to a task that is no new one; of a suite, all others are new."""
         return change

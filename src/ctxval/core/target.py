@@ -24,6 +24,7 @@ class Target(ABC):
     share: float  #: the share of the tasks that it is about
     is_noisy: ClassVar[bool] = False  #: whether executions of one task differ, so that one alone falsifies nothing
     by_draws: ClassVar[bool] = False  #: whether independent draws of tasks decide it, so that its tests are such draws
+    drawn: ClassVar[str] = "tasks"  #: what drawn tests are a sample of
 
     @classmethod
     def asked(cls, quantile: float, share: float) -> Target:
@@ -42,9 +43,23 @@ class Target(ABC):
         return {"quantile": self.quantile if self.is_noisy else None, **of_tasks}
 
     @property
+    def often(self) -> str:
+        """In how many executions of a task it holds, as a part of a sentence."""
+        return ""
+
+    @property
+    def of_distance(self) -> str:
+        """What a threshold limits in each task."""
+        return "d"
+
+    @property
     def volume(self) -> float:
         """The share of the tasks that it leaves out."""
         return round(1 - self.share, 12)
+
+    def exceeding(self, upper: str, limit: str) -> str:
+        """Return why a bound above a threshold leaves it open, if no executed distance is above it."""
+        return f"no distance above {limit} was executed, but d* may be up to {upper}"
 
     def with_noise(self) -> Target:
         """Return the target if executions of one task differ by noise."""
@@ -89,9 +104,22 @@ class Quantile(Target):
     """The largest quantile over tasks of the distances of their executions, which differ by noise."""
 
     is_noisy: ClassVar[bool] = True
+    drawn: ClassVar[str] = "executions"
 
     quantile: float = QUANTILE
     share: float = 1.0  #: the share that was asked for; with noise, none is bounded
+
+    @property
+    def often(self) -> str:
+        return f" in at least {100 * self.quantile:g} % of its executions"
+
+    @property
+    def of_distance(self) -> str:
+        return f"the {self.quantile:g} quantile of d"
+
+    def exceeding(self, upper: str, limit: str) -> str:
+        share = f"{100 * self.quantile:g} % of the executions of a task"
+        return f"{share} may have distances of up to {upper}, and the threshold is {limit}"
 
     def testable(self, highest: float, maxima: Array) -> float:
         return min(highest, float(np.median(maxima)))

@@ -145,6 +145,13 @@ class TaskSuite(TaskSpace):
         executions = self.executions(known)
         return np.asarray(self.members[executions == min(executions.min(), self.repeats - 1)])
 
+    def are_executed(self, known: Array) -> bool:
+        return bool(self.executions(known).all())
+
+    @property
+    def axes(self) -> int:
+        return 0
+
     def near(self, change: float) -> float:
         return 1e-9
 

@@ -86,8 +86,8 @@ def card(context: ReportContext, origin: str = "") -> Card:
     """
     verdict, worst = context.verdict, context.worst_first[:1]
     bound = context.bound
-    if context.suite is not None and context.suite.executions(context.points).all():
-        bound = distance_of(worst[0])  # all tasks were executed
+    if context.space.are_executed(context.points):
+        bound = distance_of(worst[0])
     executed = [trial for trial in context.trials if trial.executed]
     stated = {each.threshold for each in context.store.thresholds() or ()}
     verdicts = []

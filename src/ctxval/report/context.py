@@ -22,7 +22,6 @@ from ctxval.certificates import Certificate, CertificateOptions, Provenance, Ver
 from ctxval.certificates.envelope import Envelope
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.space import TaskSpace
-from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial, Trials, designs_sentence
 from ctxval.core.validation import Validation
@@ -133,14 +132,9 @@ class ReportContext(ShortRepr):
         return self.completed.distances
 
     @property
-    def suite(self) -> TaskSuite | None:
-        """The suite of tasks; None if tasks fill a box."""
-        return self.space if isinstance(self.space, TaskSuite) else None
-
-    @property
     def axes(self) -> int:
-        """The number of parameters along which the distance is drawn: 0 in a suite, which has no tasks between its."""
-        return 0 if self.suite else self.space.dimension
+        """The number of parameters along which the distance is drawn."""
+        return self.space.axes
 
     @property
     def task_labels(self) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ The diagnostics are those that would speak against the verdict; ``report/insight
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -21,6 +22,8 @@ from ctxval.certificates.bounds import at_most, of_tasks
 from ctxval.certificates.covering import bare_corners, farthest_task
 from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.predictions import agrees
+from ctxval.core.space import TaskSpace
+from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trial import Trial, Trials
 from ctxval.learning import ExecutionPrediction
 from ctxval.report.distance_model import distance_of
@@ -106,10 +109,11 @@ def _rests_on_distances(context: ReportContext) -> bool:
 
 def tasks_covered(context: ReportContext) -> Answer | None:
     """How far tasks are from every trial."""
-    if context.suite is not None:
-        executed, tasks = int((context.suite.executions(context.points) > 0).sum()), len(context.suite)
-        text = f"{executed} of the {tasks} tasks of the suite were executed."
-        return "good" if executed == tasks else "attention", text, {"executed": executed, "tasks": tasks}
+    return _covered(context.space, context)
+
+
+@functools.singledispatch
+def _covered(space: TaskSpace, context: ReportContext) -> Answer | None:
     if not len(context.points) or not _rests_on_distances(context):
         return None
     farthest, share = farthest_task(context.points), share_far_from_trials(context.points)
@@ -120,6 +124,13 @@ def tasks_covered(context: ReportContext) -> Answer | None:
         f"{percent(share)} of the tasks are farther than that from every trial."
     )
     return "good" if near else "attention", text, {"farthest": farthest, "share_beyond_resolution": share}
+
+
+@_covered.register(TaskSuite)
+def _(space: TaskSuite, context: ReportContext) -> Answer:
+    executed, tasks = int((space.executions(context.points) > 0).sum()), len(space)
+    text = f"{executed} of the {tasks} tasks of the suite were executed."
+    return "good" if executed == tasks else "attention", text, {"executed": executed, "tasks": tasks}
 
 
 def share_far_from_trials(points: Array) -> float:
@@ -205,25 +216,33 @@ DIAGNOSTICS: dict[str, Question] = {
 }
 
 
+@functools.singledispatch
+def _without_trials(space: TaskSpace, points: Array) -> list[str]:
+    if not len(points):
+        return []
+    share, d, sentences = share_far_from_trials(points), space.dimension, list[str]()
+    if share:
+        far = f"{percent(share)} of the task space is farther than {RESOLUTION:g} diagonals from every trial"
+        sentences.append(f"{far}; there the distance is inferred and not executed.")
+    if bare := len(bare_corners(points, RESOLUTION)):
+        where = "ends of the range" if d == 1 else "corners of the task space"
+        sentences.append(f"{bare} of the {2**d} {where} have no trial next to them.")
+    return sentences
+
+
+@_without_trials.register(TaskSuite)
+def _(space: TaskSuite, points: Array) -> list[str]:
+    names = [space.task_names[row] for row in np.flatnonzero(space.executions(points) == 0)]
+    return [f"Tasks of the suite without a distance: {enumerated(names, 20)}."] if names else []
+
+
 def not_tested(context: ReportContext) -> list[str]:
     """Return what was not tested, one sentence each."""
     sentences, certificate = list[str](), context.certificate
     if certificate is not None and certificate.volume:
         left_out = at_most(100 * certificate.volume, 3)
         sentences.append(f"The certificate leaves out {left_out} % {of_tasks(certificate.distribution)}.")
-    if context.suite is not None:
-        left = np.flatnonzero(context.suite.executions(context.points) == 0)
-        if len(left):
-            names = enumerated([context.suite.task_names[row] for row in left], 20)
-            sentences.append(f"Tasks of the suite without a distance: {names}.")
-    elif len(context.points):
-        share, d = share_far_from_trials(context.points), context.space.dimension
-        if share:
-            far = f"{percent(share)} of the task space is farther than {RESOLUTION:g} diagonals from every trial"
-            sentences.append(f"{far}; there the distance is inferred and not executed.")
-        if bare := len(bare_corners(context.points, RESOLUTION)):
-            where = "ends of the range" if d == 1 else "corners of the task space"
-            sentences.append(f"{bare} of the {2**d} {where} have no trial next to them.")
+    sentences += _without_trials(context.space, context.points)
     for trial in context.failed[:10]:
         values = zip(context.task_labels, context.tasks_of([trial])[0], strict=True)
         where = ", ".join(f"{label} = {number(value)}" for label, value in values)

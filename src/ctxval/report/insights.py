@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +14,8 @@ from ctxval._util.turns import turns
 from ctxval.certificates.bounds import state_of
 from ctxval.core import soundness
 from ctxval.core.distance import ComposedDistance
+from ctxval.core.space import TaskSpace
+from ctxval.core.task_suite import TaskSuite
 from ctxval.report.findings import Answer, Question
 from ctxval.report.markup import number, percent, quantity
 
@@ -45,16 +48,24 @@ def weak_region(context: ReportContext) -> Answer | None:
 
 def region_text(context: ReportContext, points: Array) -> str:
     """Return where points of the unit cube ``(m, d)`` lie, by the parameters in which they differ from all tasks."""
-    if context.suite is not None:
-        return f"they are {enumerated(dict.fromkeys(map(context.suite.name_at, points)), 8)}"
+    return _region(context.space, points)
+
+
+@functools.singledispatch
+def _region(space: TaskSpace, points: Array) -> str:
     low, high = np.quantile(points, [0.05, 0.95], axis=0)
     width = high - low
-    ends = context.space.from_unit(np.stack([low, high]))
+    ends = space.from_unit(np.stack([low, high]))
     parts = []
     for j in [int(j) for j in np.argsort(width) if width[j] < 0.7][:3]:  # narrower than this share of the range
-        first, last, label = number(ends[0, j], 3), number(ends[1, j], 3), context.space.labels[j]
+        first, last, label = number(ends[0, j], 3), number(ends[1, j], 3), space.labels[j]
         parts.append(f"{label} at {first}" if first == last else f"{label} from {first} to {last}")
     return f"most of them have {' and '.join(parts)}" if parts else "they are spread over the task space"
+
+
+@_region.register(TaskSuite)
+def _(space: TaskSuite, points: Array) -> str:
+    return f"they are {enumerated(dict.fromkeys(map(space.name_at, points)), 8)}"
 
 
 def weak_states(context: ReportContext) -> Answer | None:

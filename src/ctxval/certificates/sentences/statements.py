@@ -344,10 +344,11 @@ def whole_suite_statement(trusted: int, tasks: int, threshold: float, units: str
 def envelope_statement(envelope: Envelope) -> str:
     """Return what an envelope says, why it is not larger, and what nothing has checked."""
     limit = f"{at_most(envelope.threshold)} {envelope.units}".rstrip()
-    what = f"the {envelope.target.quantile:g} quantile of d" if envelope.target.is_noisy else "d"
     size = f"{100 * envelope.share:.2g} % of the tasks" if envelope.tasks is None else f"{len(envelope.tasks)} tasks"
     tasks = f"all tasks of a set of {size}" if envelope.share else "no task that can be named"
-    sentences = [f"With {percent(envelope.confidence)} confidence, {what} stays below {limit} on {tasks}."]
+    sentences = [
+        f"With {percent(envelope.confidence)} confidence, {envelope.target.of_distance} stays below {limit} on {tasks}."
+    ]
     or_irregular = " or come to contacts" if envelope.irregular else ""
     if envelope.uncovered >= 0.005:
         sentences.append(

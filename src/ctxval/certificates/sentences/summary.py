@@ -18,12 +18,11 @@ def headline(verdict: Verdict, units: str = "") -> str:
     if verdict.answer != "validated" or verdict.certificate is None:
         return f" against {threshold}: {verdict.reason}"
     certificate = verdict.certificate
-    quantile, share = certificate.details.get("quantile"), certificate.volume
+    details, share = certificate.details, certificate.volume
     which = f"at least {100 * (1 - share):.4g} % of the tasks stay" if share else "every task stays"
-    executions = f" in at least {100 * quantile:g} % of its executions" if quantile else ""
-    if certificate.kind == "suite" and not (quantile or certificate.details.get("not_executed")):
+    if certificate.kind == "suite" and details.keys().isdisjoint(("repeats", "not_executed")):
         which = "every task of the suite was executed and stays"
-    return f": {which} at or below {threshold}{executions}."
+    return f": {which} at or below {threshold}{certificate.target.often}."
 
 
 def rows(verdict: Verdict, units: str = "") -> dict[str, str]:
@@ -46,6 +45,7 @@ def rows(verdict: Verdict, units: str = "") -> dict[str, str]:
     if (pushes := tolerances(certificate, tau)) is not None:
         shown["survives"] = f"a further error of M of {push_in_words(pushes[0])} at every step"
     if (missed := tests.get("share_missed")) is not None:
-        what = "tasks" if details.get("quantile") is None else "executions"
-        shown["without assumptions"] = f"at most {at_most(100 * missed, 2)} % of the {what} exceed it ({level})"
+        shown["without assumptions"] = (
+            f"at most {at_most(100 * missed, 2)} % of the {certificate.target.drawn} exceed it ({level})"
+        )
     return shown

@@ -140,11 +140,11 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
     """Return what is validated in one sentence: which tasks stay below the threshold, by which bound, if what holds."""
     upper, limit = _bound_and_limit(certificate, tau, quantities)
     kind, details, level = certificate.kind, certificate.details, percent(certificate.confidence)
-    if kind == "suite" and details.get("quantile"):
+    if kind == "suite" and "repeats" in details:
         return (
             f"with {level} confidence, each of {counted(details['tasks'], 'task')} of the suite stays at or below "
-            f"{limit} in at least {100 * details['quantile']:g} % of its executions: the bound is {upper}, from at "
-            f"least {counted(details['repeats'], 'execution')} of each."
+            f"{limit}{certificate.target.often}: the bound is {upper}, from at least "
+            f"{counted(details['repeats'], 'execution')} of each."
         )
     if kind == "suite" and details.get("not_executed"):
         return (
@@ -156,7 +156,7 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
             f"all {details['tasks']} tasks of the suite were executed, and no distance exceeds {limit}: the largest is "
             f"{upper}."
         )
-    tests, quantile = details.get("tests"), details.get("quantile")
+    tests = details.get("tests")
     untested = "" if tests is None or tests["drawn"] else "no prediction was tested at drawn tasks (tests = 0); "
     if certificate.volume and kind != "dynamics":
         return (
@@ -164,7 +164,6 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
             f"{of_tasks(certificate.distribution)}{quantities.ranges} exceed {limit}: the {kind} bound is "
             f"{upper}, from {counted(certificate.trials, 'independent draw')}."
         )
-    which = "" if quantile is None else f" in at least {100 * quantile:g} % of its executions"
     condition = "confidence, if its assumptions hold"
     if kind == "dynamics":
         law = "the posterior" if details["parameters"] else "a Gaussian process"
@@ -177,7 +176,7 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
             diagonals = f"{resolution['diagonals']:g} diagonals; usual: {RESOLUTION:g}"
             condition += f"{_gaps(resolution, quantities)} ({diagonals})"
     given = f"if {SMALL_ERRORS}" if details.get("negligible") else f"with {level} {condition}"
-    keeps = f"every task{quantities.ranges} stays at or below {limit}{which}"
+    keeps = f"every task{quantities.ranges} stays at or below {limit}{certificate.target.often}"
     if certificate.volume:
         share = f"{100 * (1 - certificate.volume):.4g} % {of_tasks(certificate.distribution)}"
         keeps = f"at least {share}{quantities.ranges} stay at or below {limit}"
@@ -218,13 +217,11 @@ def all_conditions(
 
 def rests_on(conditions: Sequence[str], certificate: Certificate, tau: float, known: Provenance) -> str:
     """Return the evidence of a validation, what it rests on, and what independent draws say without any of it."""
-    details, tests = certificate.details, certificate.details.get("tests", {})
+    tests = certificate.details.get("tests", {})
     text = f"{_evidence(certificate, tau, known.quantities)}It rests on {'; on '.join(conditions)}."
     if tests.get("share_missed") is None:
         return text
-    what = of_tasks(certificate.distribution)
-    if details.get("quantile") is not None:
-        what = f"of the executions {what}"
+    what = f"of the {certificate.target.drawn} {of_tasks(certificate.distribution)}".removeprefix("of the tasks ")
     draws = [f"{counted(tests['spread'], 'test')} drawn as a Latin hypercube"] if tests["spread"] else []
     draws += [counted(tests["independent"], "independent draw")] if tests["independent"] else []
     return (
@@ -320,7 +317,7 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
                 once = f"the noise being normal and alike everywhere ({bounded})"
             return [f"the distance being as smooth between the trials as at them{where}", once]
         case "suite":
-            if details.get("quantile"):
+            if "repeats" in details:
                 return [INDEPENDENT_REPEATS]
             if details.get("not_executed"):
                 return [
@@ -393,13 +390,10 @@ def undecided(certificate: Certificate, tau: float, volume: float, quantities: Q
         return f"{f'{support}; but ' if support else ''}{certificate.doubt}.{suspicion}"
     upper, limit = _bound_and_limit(certificate, tau, quantities)
     if certificate.upper_bound > tau:
-        why = f"no distance above {limit} was executed, but d* may be up to {upper}"
+        why = certificate.target.exceeding(upper, limit)
         if certificate.volume:
             share = f"{100 * certificate.volume:.4g} % {of_tasks(certificate.distribution)}"
             why = f"{share} may have distances up to {upper} and more, and the threshold is {limit}"
-        if (quantile := certificate.details.get("quantile")) is not None:
-            share = f"{100 * quantile:g} % of the executions of a task"
-            why = f"{share} may have distances of up to {upper}, and the threshold is {limit}"
         why += f"{_shortfall(certificate)}."
     elif not certificate.covers(tau, certificate.volume):
         why = (

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -197,16 +198,20 @@ def find_causes(campaign: Campaign, *, most: int = 2, settings: CauseSettings = 
             raise InputError("the states of the model cannot be estimated from the recorded outputs.")
         plan = validation.plan
         executions = [ExecutedTask(plan(validation.space.from_unit(point)), run) for point, run in executed]
-        return replace(_Study(validation, executions, states, settings).report(most), failed=len(failed))
+        kind = _EstimatedStudy if validation.outputs.hide_states else _Study
+        return replace(kind(validation, executions, states, settings).report(most), failed=len(failed))
 
 
 class _Study:
+    """What explains the executions of a validation whose states are recorded."""
+
+    estimated: ClassVar[bool] = False
+
     def __init__(
         self, validation: Validation, executions: list[ExecutedTask], runs: list[Trajectory], settings: CauseSettings
     ) -> None:
         self.validation, self.executions, self.model, self.runs = validation, executions, validation.model, runs
         self.settings = settings
-        self.outputs = validation.outputs.hide_states
         horizon = min(len(run.inputs) for run in runs)
         # What inputs and jumps of the records tell is known, and not fitted.
         old = observation_delay([(each.plan.controller, each.plan.task, each.executed) for each in executions])
@@ -215,9 +220,7 @@ class _Study:
             following = [np.asarray(self.model.step(*map(np.array, (run.states[:-1], run.inputs)))) for run in runs]
         self.known = (*late, *wrapped_angles([run.states for run in runs], following))
         known = tuple(each.effect for each in self.known)
-        # Estimated states are worth little in one step.
-        long = SegmentSettings((max(1, horizon // 60), max(1, horizon // 12)))
-        taken = long if self.outputs else SegmentSettings()
+        taken = self._segments_of(horizon)
         self.segments = Segments(self.model, runs, settings=taken, known=known)
         floors = [window.floors for window in self.segments.windows]
         self.some = Segments(self.model, runs, floors, (200, 40), taken, known)  # all causes are screened on these
@@ -232,27 +235,38 @@ class _Study:
             raise InputError("the model's steps are not finite at the recorded states.")
         names = validation.names(x.shape[1], u.shape[1])
         self.plant = plant_of(self.model, executions[0].plan.task.dt, *names, x[usable], u[usable])
-        if not self.outputs:
-            states = [run.states for run in runs]
-            self.known = (*self.known, *seen_stops(self.plant.joints, states, following, self.plant.dt))
+        self.known = (*self.known, *self._stops(following))
         seconds = max(run.horizon for run in runs) * self.plant.dt
         records = x[usable], u[usable], residuals[usable]
-        estimated, count = self.outputs, len(runs)
-        self.dictionary = candidates(self.plant, *records, seconds=seconds, estimated=estimated, runs=count)
+        self.dictionary = candidates(self.plant, *records, seconds=seconds, estimated=self.estimated, runs=len(runs))
         self.loops = ClosedLoops(validation, executions)
         self.before = max(self.loops.distances)
 
+    def _segments_of(self, horizon: int) -> SegmentSettings:
+        return SegmentSettings()
+
+    def _stops(self, following: list[Array]) -> Iterable[EffectCandidate]:
+        return seen_stops(self.plant.joints, [run.states for run in self.runs], following, self.plant.dt)
+
+    def _by_what_is_seen(self) -> Explained | None:
+        """Return how well what inputs and jumps of the records tell explains the executions."""
+        known = ModelWithEffects(self.model, tuple(each.effect for each in self.known))
+        return self._in_closed_loop(Explanation(self.known, known, 0.0, 1.0))
+
+    def _noise(self, explanation: Explanation) -> Array:
+        return self.segments.noise(explanation.repaired)
+
+    def _distance_from_tasks(self, repaired: ModelWithEffects) -> float | None:
+        return self.loops.distance_from_tasks(repaired)
+
     def report(self, most: int) -> CauseReport:
-        first = None
-        if self.known or not self.outputs:
-            known = ModelWithEffects(self.model, tuple(each.effect for each in self.known))
-            first = self._in_closed_loop(Explanation(self.known, known, 0.0, 1.0))
+        first = self._by_what_is_seen()
         if first is not None and first.complete >= self.settings.named:
             if self.known:
                 return self._reported([first], [], False)
             offset = self._offset_of_starts()
             return self._reported([] if offset is None else [replace(first, explanation=offset)], [], True)
-        parameters = None if self.known or self.outputs else self._of_parameters()
+        parameters = None if self.known else self._of_parameters()
         if parameters is not None and parameters.counts(self.before) and parameters.complete >= self.settings.named:
             return self._reported([parameters], [], False)
         with stage("fitting causes", (2 * most - 1) * len(self.dictionary), "causes"):
@@ -318,8 +332,8 @@ class _Study:
 
     def _reported(self, group: list[Explained], ranked: list[Explanation], began_elsewhere: bool) -> CauseReport:
         named = bool(group) and group[0].counts(self.before) and group[0].complete >= self.settings.named
-        is_measured = group and not self.outputs and not began_elsewhere
-        from_tasks = self.loops.distance_from_tasks(group[0].explanation.repaired) if is_measured else None
+        is_measured = group and not began_elsewhere
+        from_tasks = self._distance_from_tasks(group[0].explanation.repaired) if is_measured else None
         return CauseReport(
             plant=self.plant,
             explained=tuple(group),
@@ -415,7 +429,7 @@ class _Study:
 
     def _in_closed_loop(self, explanation: Explanation) -> Explained:
         """Return how well causes predict each execution if they are fitted to the others."""
-        noise = np.zeros(self.segments.states.shape[1]) if self.outputs else self.segments.noise(explanation.repaired)
+        noise = self._noise(explanation)
         predicted, sizes = list[Predicted](), []
         for k, (execution, others) in enumerate(zip(self.executions, self.others, strict=True)):
             fitted = explained(others, explanation.candidates, explanation.sizes, near=True)
@@ -455,6 +469,30 @@ class _Study:
                     apart = float(self.validation.distance_between(first, loop, plan.task))
                     best = Separating(space.describe_point(point), apart, number, gap)
         return best
+
+
+class _EstimatedStudy(_Study):
+    """What explains the executions of a validation whose states are estimated from outputs, and begin anywhere."""
+
+    estimated = True
+
+    def _segments_of(self, horizon: int) -> SegmentSettings:
+        return SegmentSettings((max(1, horizon // 60), max(1, horizon // 12)))  # one step of estimates is worth little
+
+    def _stops(self, following: list[Array]) -> Iterable[EffectCandidate]:
+        return ()
+
+    def _by_what_is_seen(self) -> Explained | None:
+        return super()._by_what_is_seen() if self.known else None
+
+    def _of_parameters(self) -> Explained | None:
+        return None
+
+    def _noise(self, explanation: Explanation) -> Array:
+        return np.zeros(self.segments.states.shape[1])
+
+    def _distance_from_tasks(self, repaired: ModelWithEffects) -> float | None:
+        return None
 
 
 def _is_nothing(candidate: EffectCandidate) -> bool:

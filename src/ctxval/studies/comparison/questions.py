@@ -18,7 +18,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
-from ctxval.campaign.interval_search import IntervalSearch
+from ctxval.campaign.suite_intervals import interval_search
 from ctxval.certificates import CertificateOptions, judge
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.bounds import ERRORS
@@ -77,7 +77,7 @@ class WorstQuestion:
                 else:
                     self._execute(worse, Choice(task, "covering"), value)
                 return True
-            choice = IntervalSearch(better.recorder, self.options, self.budget, worse.largest).choose()
+            choice = interval_search(better.recorder, self.options, self.budget, worse.largest).choose()
             if choice is None and self._certified(better):
                 continue
             self._execute(better if better.recorder.has_tasks else worse, choice or Choice())
@@ -142,7 +142,7 @@ class WorstQuestion:
 
     def _execute(self, candidate: Candidate, choice: Choice, predicted: float | None = None) -> None:
         note = TrialNote(self.executions.steps, "worst", predicted=predicted)
-        predicts = IntervalSearch(candidate.recorder, self.options, self.budget).predicts
+        predicts = interval_search(candidate.recorder, self.options, self.budget).predicts
         self.executions.execute(candidate, choice, note, predicts=predicts)
 
 

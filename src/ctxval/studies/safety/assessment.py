@@ -93,8 +93,7 @@ class SafetyReport(ShortRepr):
         unit = f" {self.units}".rstrip()
         if self.d_b_bound is None:
             return f"no margin is certified: {self.doubt}."
-        quantile = None if self.certificate is None else self.certificate.details.get("quantile")
-        often = "" if quantile is None else f" in {100 * quantile:g} % of its executions"
+        often = "" if self.certificate is None else self.certificate.target.often
         return (
             f"With {100 * self.confidence:g} % confidence, every task that M satisfies with a robustness above "
             f"{self.d_b_bound:.4g}{unit} is safe on S at its recorded times{often}: "
