@@ -26,6 +26,7 @@ from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.gp.cholesky import CholeskyFactor
 from ctxval.learning.effects.effect import Effect
+from ctxval.learning.effects.friction import slowness
 from ctxval.learning.settling import SettlingModel
 from ctxval.models.increments import standard_deviations
 
@@ -156,7 +157,7 @@ class DryFriction(Effect, SettlingModel):
     def _limits(self, u: Array, before: Array, after: Array) -> Array:
         """Return the largest friction in steps with these inputs and between these rates; shapes ``(..., m)``."""
         largest = self.sliding + self.load * np.abs(u)
-        return largest + self.excess * _slowness(before, after, self.slow) if self.excess.any() else largest
+        return largest + self.excess * slowness(before, after, self.slow) if self.excess.any() else largest
 
     def pushes(
         self, transitions: Transitions, missed: Callable[[Array, Array], Array], errors: Array | None = None
@@ -325,7 +326,7 @@ def found_friction(
         left_over, largest = loaded, by_load
     shapes = shapes if grows else [moves]
     slow_rates = np.geomspace(settings.at_rest, settings.fast, 11).tolist()
-    slowed = {slow: fitted([*shapes, moves * _slowness(before, after, slow * usual)]) for slow in slow_rates}
+    slowed = {slow: fitted([*shapes, moves * slowness(before, after, slow * usual)]) for slow in slow_rates}
     slow = min(slowed, key=lambda each: slowed[each][0])
     if falls := slowed[slow][0] ** 2 < settings.better_shape * left_over**2:
         largest = slowed[slow][1]
@@ -351,16 +352,6 @@ def _beside(basis: Array, values: Array) -> Array:
     """Return what is left of values ``(N, ...)`` beside the columns of an orthonormal basis ``(N, k)``."""
     flat = values.reshape(len(values), -1)
     return (flat - basis @ (basis.T @ flat)).reshape(values.shape)
-
-
-def _slowness(before: Array, after: Array, slow: Array) -> Array:
-    """Return the mean of ``exp(-(rate / slow)^2)`` over steps in which rates change evenly; all shapes ``(..., m)``."""
-    first, last = before / slow, after / slow
-    same = np.abs(last - first) < 1e-4
-    mean = (
-        0.5 * np.sqrt(np.pi) * (scipy.special.erf(last) - scipy.special.erf(first)) / np.where(same, 1.0, last - first)
-    )
-    return np.where(same, np.exp(-(first**2)), mean)
 
 
 def _creep(transitions: Transitions, reached: Array, effects: Array, rates: Rows, still: Array) -> Array:
