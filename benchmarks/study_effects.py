@@ -164,7 +164,7 @@ def measured(run: tuple[str, int, float]) -> dict[str, Any]:
             return {**key, "true": true, **outcome(campaign, verdict, largest, started), **found}
         validation = validation_of(name, seed, exact=True)
         campaign = Campaign(validation, search=searches.by_name("random"), seed=seed).run(EXECUTIONS)
-        report = find_causes(campaign)
+        report = find_causes(campaign, thinking=np.inf)
         causes = [[type(cause).__name__, list(cause.sizes)] for cause in report.causes]
         seconds = round(time.process_time() - started, 1)
         return {**key, "true": true, "causes": causes, "sentence": report.sentence, "seconds": seconds}

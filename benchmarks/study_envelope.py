@@ -77,7 +77,7 @@ def study(system: str, seed: int) -> dict[str, Any]:
     begun = time.process_time()
     campaign = Campaign(validation_of(system, seed), seed=seed)
     campaign.run(BUDGET, threshold, envelope=True, confidence=CONFIDENCE, thinking=np.inf)
-    envelope = campaign.envelope(threshold, CONFIDENCE)
+    envelope = campaign.envelope(threshold, CONFIDENCE, thinking=np.inf)
     points, distances, kept = points[::2], distances[::2], kept[::2]  # closed loops of all would take minutes
     trusted, interpolated = envelope.trusted(points), envelope.trusted(points, interpolated=True)
     false = trusted & ~kept

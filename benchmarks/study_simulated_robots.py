@@ -148,7 +148,7 @@ def explained(robot: str, system: str, seed: int, limit: float) -> dict[str, Any
     campaign = Campaign(ROBOTS[robot].make(changes), search=searches.by_name("random"), seed=seed)
     try:
         with at_most(limit):
-            report = find_causes(campaign.run(EXECUTIONS), most=len(changes) or 2)
+            report = find_causes(campaign.run(EXECUTIONS), most=len(changes) or 2, thinking=np.inf)
     except NotEnded:
         return {"answer": "not ended", "causes": [], "cpu": time.process_time() - begun}
     first = report.explained[0] if report.explained else None

@@ -24,7 +24,7 @@ from ctxval.certificates.options import CertificateOptions
 from ctxval.core.controller import started
 from ctxval.data.recorded_system import RecordedInputsWarning
 from ctxval.studies.causes import find_causes
-from ctxval.studies.causes.find import CauseSettings
+from ctxval.studies.causes.budget import CauseSettings
 from json_lines import JsonLines
 from robots import double_pendulum, so101
 
@@ -138,7 +138,7 @@ def explained(known: Validation, unknown: Validation, seed: int) -> dict[str, An
     """Return the one cause that executions of one suite show, and the largest distances of another with the repair."""
     started, before = time.process_time(), all_distances(unknown)
     campaign = Campaign(known, seed=seed).run(len(all_distances(known)), 1e3, thinking=1.0)
-    report = find_causes(campaign, most=1, settings=CauseSettings(executions=4))
+    report = find_causes(campaign, most=1, thinking=np.inf, settings=CauseSettings(executions=4))
     found = {"named": report.named, "sentence": report.sentence, "before": float(before.max())}
     if report.repaired is not None:
         after = all_distances(unknown.with_parts(model=report.repaired))

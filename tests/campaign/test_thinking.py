@@ -13,8 +13,11 @@ from conftest import make_validation
 from ctxval import Campaign, Trial
 from ctxval.campaign.dynamics import PREDICTION
 from ctxval.campaign.thinking import THINKING, CampaignThinking
-from ctxval.errors import InputError
+from ctxval.certificates import CertificateOptions
+from ctxval.errors import CertificateError, InputError
 from ctxval.learning.stage_costs import Ledger, Speed
+from ctxval.studies.causes import find_causes
+from facts import assert_names, refuses
 
 SPEED = Speed(1.0, 1e-4, 1e-5, 1e-4, 1e-5, True, True, 2, 1, 25)
 SLOW = replace(SPEED, design=0.1, another_design=0.1, step=0.05, another_step=0.05, together=False, batched=False)
@@ -74,6 +77,53 @@ def test_evidence_that_does_not_fit_decides_nothing_until_there_is_time(measured
     again = campaign.verdict(threshold, thinking=50 * short.shortage["suggested"])
     assert again.shortage is None
     assert campaign.executions == executions
+
+
+def test_certificates_keep_the_budget_and_name_the_time_that_they_need(measured: list[Speed]) -> None:
+    measured[0] = SLOW
+    campaign = Campaign(make_validation(), seed=0).run(4, 100.0, thinking=1.0)
+    with refuses(CertificateError, "--thinking"):
+        campaign.certify(thinking=1.0)
+    with refuses(CertificateError, "--thinking"):
+        campaign.assessed(100.0, CertificateOptions(), 1.0)
+    falsified = campaign.assessed(1e-6, CertificateOptions(), 1.0)
+    assert falsified.certificate is None
+    assert_names(falsified.refusal, "--thinking")
+    assert falsified.verdict is not None
+    assert falsified.verdict.answer == "falsified"
+
+
+def test_envelopes_of_a_budget_run_fewer_closed_loops_or_name_the_time_that_they_need(measured: list[Speed]) -> None:
+    tau = 0.5
+    campaign = Campaign(make_validation(), seed=0).run(14, tau, envelope=True)
+    free, large = (campaign.envelope(tau, thinking=each) for each in (np.inf, 1e4))
+    assert free.thinking is None
+    assert large.to_json() == free.to_json()
+    assert free.evaluated > 64
+    found = [campaign.envelope(tau, thinking=seconds) for seconds in np.geomspace(0.1, 20.0, 12)]
+    short = [each for each in found if each.doubt is not None]
+    fewer = [each for each in found if each.doubt is None and each.thinking is not None]
+    assert fewer
+    assert all(each.evaluated < free.evaluated for each in fewer)
+    assert all(each.thinking is not None and each.thinking["replaced"] for each in fewer)
+    assert [(each.thinking or {})["code"] for each in short] == ["no_time"] * len(short)
+    assert short
+    # What fewer loops trust is trusted.
+    tasks = campaign.validation.space.iid(200, np.random.default_rng(3))
+    true = campaign.validation.distances(tasks)
+    assert (true[fewer[0].trusted(tasks)] <= tau).all()
+
+
+def test_a_search_for_causes_reads_less_or_names_the_time_that_it_needs(measured: list[Speed]) -> None:
+    measured[0] = replace(SPEED, step=2e-3)
+    campaign = Campaign(make_validation(), seed=0).run(8)
+    free = find_causes(campaign, thinking=np.inf)
+    fewer = find_causes(campaign, thinking=6.0)
+    assert free.replaced == ()
+    assert (fewer.replaced != (), fewer.executions < free.executions) == (True, True)
+    assert fewer.to_json()["thinking"] == {"replaced": list(fewer.replaced)}
+    with refuses(InputError, "--thinking"):
+        find_causes(campaign, thinking=1e-2)
 
 
 def test_a_resumed_campaign_makes_the_same_choices(measured: list[Speed], tmp_path: Path) -> None:

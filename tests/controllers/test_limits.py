@@ -116,7 +116,7 @@ def test_the_controller_of_one_task_keeps_the_limits() -> None:
 
 def test_limits_that_exclude_zero_are_kept_from_the_first_iterate_on() -> None:
     task = Task([0.5, 0.0], horizon=15, dt=0.05)
-    inputs = ILQR(Q, R, limits={"low": 0.5, "high": 2.0}).solve(task, PENDULUM).controller.inputs
+    inputs = ILQR(Q, R, limits=[[0.5, 2.0]]).solve(task, PENDULUM).controller.inputs
     assert ((inputs >= 0.5) & (inputs <= 2.0)).all()
 
 
@@ -124,5 +124,7 @@ def test_limits_that_exclude_zero_are_kept_from_the_first_iterate_on() -> None:
 def test_limits_are_checked_and_described(kind: Any) -> None:
     with refuses(InputError, "high", "limits"):
         kind(Q, R, limits=[(1.0, -1.0)])
+    with refuses(InputError, "limits = [[0.5, 2.0]]"):
+        kind(Q, R, limits={"low": 0.5, "high": 2.0})
     assert describe(kind(Q, R, limits=2.0))["limits"]["high"] == [2.0]
     assert "limits" not in describe(kind(Q, R))

@@ -43,7 +43,7 @@ from ctxval.certificates.evidence import Learned
 from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.certificates.sample import without_success
-from ctxval.certificates.verdict import counterexample
+from ctxval.certificates.verdict import Assessment, counterexample
 from ctxval.core.distance import Distance
 from ctxval.core.plan import StartOffset, input_difference, start_offset
 from ctxval.core.trajectory import Trajectory
@@ -618,17 +618,37 @@ class Campaign:
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
         share: float = 1.0,
+        thinking: TimeLimit | None = None,
         progress: bool | None = None,
     ) -> Certificate:
         """Return the bound on d*, which needs no threshold. The arguments are those of :meth:`verdict`.
 
-        A CertificateError is raised if the theory of the certificate refuses the trials.
+        Raises:
+            CertificateError: if the theory of the certificate refuses the trials, or if its evidence needs more
+                seconds than ``thinking`` allows.
         """
         options = CertificateOptions.or_automatic(certificate, confidence, resolution, share)
-        with progress_shown(progress), stage("certifying"):
-            certified = assess(self.trials, options, provenance=self.provenance_for(options)).certificate
+        with progress_shown(progress):
+            certified = self.assessed(None, options, thinking).certificate
         assert certified is not None  # without a threshold, a refusal is raised
         return certified
+
+    def assessed(self, threshold: float | None, options: CertificateOptions, thinking: float | None) -> Assessment:
+        """Return the certificate of :meth:`certify` with a verdict on a threshold, if there is one.
+
+        Raises:
+            CertificateError: as :meth:`certify`, if no trial exceeds the threshold.
+        """
+        dynamics, trials = self.recorder.dynamics, self.trials
+        with stage("certifying"), dynamics.limited(thinking, trials):
+            known = self.provenance_for(options)
+            if dynamics.shortage is None:
+                return assess(trials, options, threshold, known)
+            target, refusal = options.kind.target, f"{dynamics.shortage}."
+            falsified = threshold and counterexample(trials, threshold, known.quantities, options.confidence, target)
+            if not falsified:
+                raise CertificateError(refusal)
+            return Assessment(options.kind.name, None, falsified, refusal)
 
     @checked
     def watch(
@@ -662,6 +682,7 @@ class Campaign:
         confidence: float = CONFIDENCE,
         *,
         certificate: CertificateOptions | None = None,
+        thinking: TimeLimit | None = None,
         progress: bool | None = None,
     ) -> Envelope:
         """Return the set of tasks on which d stays below a threshold, with a confidence for all of them at once.
@@ -673,6 +694,7 @@ class Campaign:
             threshold: tau, in the units of the distance.
             confidence: the confidence that d stays below the threshold on all tasks of the set.
             certificate: the options ``auto`` or ``dynamics``, in place of the confidence.
+            thinking: as in :meth:`verdict`. Closed loops are run on fewer tasks if not all fit.
             progress: as in :meth:`run`.
 
         Raises:
@@ -680,7 +702,7 @@ class Campaign:
         """
         options = CertificateOptions.or_automatic(certificate, confidence, RESOLUTION)
         search = EnvelopeSearch(interval_search(self.recorder, options, self.executions + 1, threshold, keeps=False))
-        with progress_shown(progress):
+        with progress_shown(progress), self.recorder.dynamics.limited(thinking, self.trials):
             return search.envelope()
 
     def surrogate(self) -> Surrogate:

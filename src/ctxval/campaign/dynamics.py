@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import json
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -37,7 +37,7 @@ from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.coverage import beyond_range, unsampled_corner
 from ctxval.learning.prediction import Executed
 from ctxval.learning.sensitivity import Sensitivity, found_sensitivity
-from ctxval.learning.stage_costs import Ledger
+from ctxval.learning.stage_costs import Costs, Ledger, Sizes, Thinking
 from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
@@ -247,34 +247,60 @@ class CampaignDynamics:
 
     def _within_budget(self, trials: Sequence[Trial], confidence: float) -> Evidence | None:
         """Return the whole evidence; None if nothing can be learned, or if the budget of a verdict does not suffice."""
-        learned, ledger = self.learned(trials), self.ledger(trials)
-        with self.thinking.deciding():
-            budget = self.thinking.after(trials)
+        with self.deciding(trials) as (learned, ledger, budget):
             if budget is None or ledger.costs is None:
                 return None if learned is None else self._whole(learned, trials, confidence, ledger)
-            # The choice of a task may have left out what the longer time of a verdict allows.
-            incomplete = ledger.spent_up or (learned is not None and not learned.is_complete)
-            if incomplete and budget.seconds > ledger.costs.thinking.seconds:
-                learned, ledger = self.learned(trials), self.ledger(trials)
-        if learned is None and not ledger.spent_up:
-            return None
-        by, draws, replicates = self.study.search.settings, draws_for(confidence), 1
-        if learned is not None and learned.is_complete:
-            replicates = 1 if learned.noisy is None else learned.noisy.replicates
-            learned = learned.with_whole_search()
-        with ledger.within(budget), ledger.spending("loops"):
-            # Errors of M that are negligible are no function to search.
-            is_cheap = learned is not None and not learned.posterior.data.learned.any()
-            needed = 0.0 if is_cheap else ledger.seconds("loops", lambda costs: costs.whole(by, draws, replicates))
-            if learned is not None and not ledger.incomplete and needed <= ledger.left:
-                ledger.add("loops", needed)
-                evidence = self._whole(learned, trials, confidence, ledger)
-                if not ledger.missing:
-                    return replace(evidence, replaced=tuple(dict.fromkeys(ledger.replaced)))
-                needed = ledger.missing
-            needed += sum(ledger.expected.values()) + ledger.incomplete
-            self.shortage = TimeShortage(needed, budget.seconds, tuple(dict.fromkeys(ledger.replaced)))
-            return None
+            if learned is None and not ledger.spent_up:
+                return None
+            by, draws, replicates = self.study.search.settings, draws_for(confidence), 1
+            if learned is not None and learned.is_complete:
+                replicates = 1 if learned.noisy is None else learned.noisy.replicates
+                learned = learned.with_whole_search()
+            with ledger.within(budget), ledger.spending("loops"):
+                # Errors of M that are negligible are no function to search.
+                is_cheap = learned is not None and not learned.posterior.data.learned.any()
+                needed = 0.0 if is_cheap else ledger.seconds("loops", lambda costs: costs.whole(by, draws, replicates))
+                if learned is not None and not ledger.incomplete and needed <= ledger.left:
+                    ledger.add("loops", needed)
+                    evidence = self._whole(learned, trials, confidence, ledger)
+                    if not ledger.missing:
+                        return replace(evidence, replaced=tuple(dict.fromkeys(ledger.replaced)))
+                    needed = ledger.missing
+                needed += sum(ledger.expected.values()) + ledger.incomplete
+                self.shortage = TimeShortage(needed, budget.seconds, tuple(dict.fromkeys(ledger.replaced)))
+                return None
+
+    @contextlib.contextmanager
+    def limited(self, thinking: float | None, trials: Sequence[Trial]) -> Iterator[None]:
+        """Limit all that is computed of trials meanwhile to a number of seconds; None for the default."""
+        self.shortage = None
+        with self.thinking.limited(thinking):
+            self.thinking.measure(trials)
+            yield
+
+    def ledger_of_decision(self, thinking: float | None, trials: Sequence[Trial]) -> Ledger:
+        """Return a ledger with the time of a verdict, for a study that learns nothing else."""
+        with self.limited(thinking, trials), self.thinking.deciding():
+            budget = self.thinking.after(trials)
+        if budget is None:
+            return Ledger()
+        known = Trials(trials).executions
+        return Ledger(Costs(budget, Sizes.of(budget.speed, self.study.validation.space.dimension, known, 0)))
+
+    @contextlib.contextmanager
+    def deciding(self, trials: Sequence[Trial]) -> Iterator[tuple[LearnedDynamics | None, Ledger, Thinking | None]]:
+        """Give what trials teach in the time of a verdict, the ledger of this, and the budget of the verdict."""
+        learned, ledger = self.learned(trials), self.ledger(trials)
+        with contextlib.ExitStack() as stack:
+            with self.thinking.deciding():
+                budget = self.thinking.after(trials)
+            if budget is not None and ledger.costs is not None:
+                # The choice of a task may have left out what the longer time of a verdict allows.
+                incomplete = ledger.spent_up or (learned is not None and not learned.is_complete)
+                if incomplete and budget.seconds > ledger.costs.thinking.seconds:
+                    stack.enter_context(self.thinking.deciding())
+                    learned, ledger = self.learned(trials), self.ledger(trials)
+            yield learned, ledger, budget
 
     def kept_evidence(self, trials: Sequence[Trial], confidence: float) -> Evidence | None:
         """Return :meth:`evidence` that the store keeps for these trials; None if there is none."""

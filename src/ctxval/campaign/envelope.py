@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -15,11 +15,13 @@ from ctxval._util.texts import reason_of
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.interval_search import IntervalSearch
+from ctxval.campaign.thinking import TimeShortage
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates.automatic import Automatic, WholeSuite
 from ctxval.certificates.drawn_distances import DrawnDistances
 from ctxval.certificates.dynamics import Dynamics, draws_for
 from ctxval.certificates.envelope import (
+    ENVELOPE,
     Envelope,
     boundary_tasks,
     doubt_of_envelope,
@@ -39,6 +41,7 @@ from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trial import Trial, Trials
 from ctxval.errors import InputError
 from ctxval.learning import LearnedDynamics
+from ctxval.learning.stage_costs import Costs, Ledger, Thinking
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,9 @@ class CandidateSettings:
 
     candidates: int = 8192  #: tasks among which these are chosen
     screened: int = 256  #: tasks of the pool among which the next one is chosen
+    boundary: int = 512  #: tasks next to the boundary at which closed loops are run, in each of several rounds
+    checks: int = 256  #: further tasks that check the interpolation between all these
+    noisy: tuple[int, int, int] = (192, 64, 64)  #: pool, boundary and checks if each draw has sequences of noise
 
 
 CANDIDATES = CandidateSettings()
@@ -54,6 +60,25 @@ CANDIDATES = CandidateSettings()
 
 
 _SAME_TASK = 1e-6
+
+
+@dataclass(frozen=True)
+class TaskCounts:
+    """Numbers of tasks whose closed loops are run on all draws."""
+
+    pool: int  #: spread over the task space; the executed tasks come with them
+    boundary: tuple[int, ...] = ()  #: next to the boundary of the envelope, in rounds
+    checks: int = 0  #: that check the interpolation
+
+    @property
+    def tasks(self) -> int:
+        """The number of all tasks, with those outside of the interpolated set."""
+        return self.pool + sum(self.boundary) + self.checks + (self.checks // 2 or ENVELOPE.others)
+
+    def part(self, share: float) -> TaskCounts:
+        """Return a share of all numbers."""
+        pool, checks, *boundary = (round(share * each) for each in (self.pool, self.checks, *self.boundary))
+        return TaskCounts(pool, tuple(boundary), checks)
 
 
 class EnvelopeSearch:
@@ -72,6 +97,7 @@ class EnvelopeSearch:
         self._interval, self._recorder = interval, interval.recorder
         self._threshold, self._confidence = interval.limit, interval.options.confidence
         self._split: tuple[tuple[int, ...], LearnedDynamics | None] | None = None
+        self._ledger = Ledger()  # of the present choice or envelope; learning was taken from it before
 
     def envelope(self) -> Envelope:
         """Return the envelope that the executions give, or why there is none. The system is never executed."""
@@ -83,10 +109,14 @@ class EnvelopeSearch:
         if unknown is not None:
             why = f"trial {unknown.number} has no distance, so nothing is known of its task; execute it again"
             return withdrawn(space, threshold, confidence, why)
-        with stage("computing the envelope", unit="closed loops"):
+        dynamics = self._recorder.dynamics
+        with stage("computing the envelope", unit="closed loops"), dynamics.deciding(trials) as (_, ledger, budget):
+            self._begin(ledger, budget)
+            if ledger.spent_up or ledger.incomplete:
+                return self._without_time(ledger.incomplete)
             known = self._known(trials)
             if known is None:
-                why = self._recorder.dynamics.failure or (
+                why = dynamics.failure or (
                     "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "
                     "controller can be designed"
                 )
@@ -100,6 +130,26 @@ class EnvelopeSearch:
             smooth = self._of(*known, trials)  # soft contacts can be learned
             return envelope if envelope.share > smooth.share else smooth
 
+    def _begin(self, ledger: Ledger, budget: Thinking | None) -> None:
+        """Begin a choice or an envelope with a budget, from which what was learned is taken."""
+        costs = ledger.costs
+        self._ledger = Ledger(None if costs is None or budget is None else replace(costs, thinking=budget))
+        for kind, seconds in ledger.expected.items():
+            if kind != "loops":
+                self._ledger.add(kind, seconds)
+        self._ledger.replaced += ledger.replaced
+
+    def _without_time(self, missing: float) -> Envelope:
+        """Return an envelope that is not stated, as its budget lacks some seconds."""
+        costs, ledger = self._ledger.costs, self._ledger
+        assert costs is not None
+        # With more time, more stages of learning may fit, and take it.
+        needed = max(sum(ledger.expected.values()) + missing, costs.thinking.seconds)
+        replaced = tuple(dict.fromkeys(ledger.replaced))
+        shortage = TimeShortage(needed, costs.thinking.seconds, replaced, "the envelope")
+        none = withdrawn(self._recorder.validation.space, self._threshold, self._confidence, str(shortage))
+        return replace(none, thinking=shortage.to_json())
+
     def _of(self, learned: LearnedDynamics, evidence: Evidence, trials: Sequence[Trial]) -> Envelope:
         """Return the envelope of what was learned, or why there is none."""
         space, units = self._recorder.validation.space, self._recorder.validation.labels.units
@@ -108,8 +158,6 @@ class EnvelopeSearch:
         failed = without_success(trials)
         known = [trial for trial in trials if trial.distance is not None or trial in failed]
         executed = [(trial.unit_point, trial.least) for trial in known]
-        # Further tasks check the interpolation between these; without batches, each costs a design of its own.
-        checks = (64 if evidence.target.is_noisy else 256) if learned.study.planner.batched else 0
         try:
             if learned.split is not None:
                 evidence = self._left_out(learned, evidence)
@@ -121,16 +169,30 @@ class EnvelopeSearch:
                     if distance <= threshold:
                         doubt = f"trial {trial.number} failed beyond the threshold, and the learned dynamics keep it"
                         return withdrawn(space, threshold, confidence, f"{doubt}; record more executions near its task")
-            drawn, irregular = self._drawn(learned, evidence), learned.split.irregular if learned.split else 0
-            at = partial(self._at, learned)
-            return envelope_of(space, drawn, evidence, executed, threshold, confidence, at, checks, units, irregular)
+            counts, missing = self._counts(learned, evidence)
+            if missing:
+                return self._without_time(missing)
+            drawn, irregular = self._drawn(learned, evidence, counts), learned.split.irregular if learned.split else 0
+            given = space, drawn, evidence, executed, threshold, confidence
+            envelope = envelope_of(*given, partial(self._at, learned), counts.checks, units, irregular)
+            replaced = list(dict.fromkeys(self._ledger.replaced))
+            return replace(envelope, thinking={"replaced": replaced}) if replaced else envelope
         except Exception as error:  # users' parts, at states that no execution has reached
             return withdrawn(space, threshold, confidence, reason_of(error))
 
     def _regular(self, trials: Sequence[Trial], evidence: Evidence) -> tuple[LearnedDynamics, Evidence] | None:
-        """Return what the regular transitions teach; None if all are regular, or if there is noise in them."""
+        """Return what the regular transitions teach; None if all are regular, or if there is noise in them.
+
+        It is left out if it does not fit into the budget: then contacts are learned with all other steps.
+        """
         numbers = tuple(trial.number for trial in trials)
         if self._split is None or self._split[0] != numbers:
+            tests = sum(each.is_test for each in evidence.predictions)
+            if not self._ledger.optional(
+                "learning", "the part of the dynamics that is smooth between contacts",
+                lambda costs: 4 * costs.learning() + tests * (costs.posterior() + self._seconds(1)(costs)),
+            ):  # fmt: skip
+                return None
             try:
                 self._split = numbers, self._recorder.dynamics.regular(trials)
             except Exception:  # users' parts
@@ -185,6 +247,9 @@ class EnvelopeSearch:
             return None
         if any(trial.least <= self._threshold for trial in without_success(trials)):
             return None
+        with recorder.dynamics.thinking.deciding():
+            budget = recorder.dynamics.thinking.after(trials)
+        self._begin(recorder.dynamics.ledger(trials), budget)
         known = self._known(trials)
         if known is None:
             return None
@@ -198,7 +263,11 @@ class EnvelopeSearch:
         if parameter is not None and parameter.gap > evidence.limits.gap:
             return Choice.tested(parameter.task)
         space, pool = recorder.validation.space, learned.study.search.pool
-        drawn = self._at(learned, space.candidates(pool[: CANDIDATES.screened]), settled=False)
+        screened = min(CANDIDATES.screened, len(pool))
+        parts = [round(share * screened) for share in learned.study.settings.thinking.shares]
+        replicates = 1 if learned.noisy is None else learned.noisy.replicates
+        fitting = (part for part in parts if self._ledger.fits("loops", self._seconds(part, replicates)))
+        drawn = self._at(learned, space.candidates(pool[: next(fitting, parts[-1])]), settled=False)
         below, leaving = drawn.mean <= self._threshold, drawn.uncovered(evidence.most_beyond)
         # Within three spreads above the mean, a task is uncertain.
         straddle = 3.0 * drawn.spread(self._threshold) - np.abs(drawn.mean - self._threshold)  # Bryan et al. 2006
@@ -227,26 +296,52 @@ class EnvelopeSearch:
     def _known(self, trials: Sequence[Trial]) -> tuple[LearnedDynamics, Evidence] | None:
         """Return what the executions teach, and what they say of the predictions."""
         dynamics = self._recorder.dynamics
+        ledger = dynamics.ledger(trials)
+        before = ledger.expected.get("loops", 0.0)
         learned, evidence = dynamics.learned(trials), dynamics.screening(trials)
+        self._ledger.add("loops", ledger.expected.get("loops", 0.0) - before)
         if learned is None or evidence is None:
             return None
         noise, without = learned.drawn_from.noise, learned.posterior.covariances.without_model
         needed = evidence.needing(self._interval.tests)
         return learned, replace(needed, confidence=self._confidence, noise=noise, without_model=without)
 
-    def _drawn(self, learned: LearnedDynamics, evidence: Evidence) -> DrawnDistances:
+    def _seconds(self, tasks: int, replicates: int = 1) -> Callable[[Costs], float]:
+        """Return the seconds of the closed loops of so many tasks on all draws."""
+        draws = draws_for(self._confidence)
+        return lambda costs: costs.draws(20) + costs.plan(tasks) + costs.run(draws + 1, tasks, replicates)
+
+    def _counts(self, learned: LearnedDynamics, evidence: Evidence) -> tuple[TaskCounts, float]:
+        """Return the most tasks that fit into the budget, and the seconds that the fewest lack; 0 if they fit."""
+        pool, space, executed = len(learned.study.search.pool), self._recorder.validation.space, len(learned.executed)
+        counts, shares = TaskCounts(pool), learned.study.settings.thinking.shares
+        if space.members is not None:
+            shares = (1.0,)  # all tasks of a suite
+        elif learned.study.planner.batched:  # else each further task costs a design of its own
+            rounds = max(space.dimension // 2, 1)
+            counts = TaskCounts(pool, (CANDIDATES.boundary,) * rounds, CANDIDATES.checks)
+            if evidence.target.is_noisy:  # each draw has sequences of noise
+                pool, boundary, checks = CANDIDATES.noisy
+                counts = TaskCounts(min(len(learned.study.search.pool), pool), (boundary,), checks)
+        replicates, missing = 1 if learned.noisy is None else learned.noisy.replicates, 0.0
+        for share in shares:
+            part = counts.part(share)
+            seconds = self._seconds(part.tasks + executed, replicates)
+            missing = self._ledger.seconds("loops", seconds)
+            if self._ledger.fits("loops", seconds):
+                if share < 1:
+                    self._ledger.replaced.append(f"closed loops on {part.tasks} tasks in place of {counts.tasks}")
+                return part, 0.0
+        return counts, missing
+
+    def _drawn(self, learned: LearnedDynamics, evidence: Evidence, counts: TaskCounts) -> DrawnDistances:
         """Return the drawn distances of the pool's tasks, of executed ones and of tasks next to the boundary."""
         pool, space = learned.study.search.pool, self._recorder.validation.space
         if space.members is not None:
             return self._at(learned, pool)
-        noisy = evidence.target.is_noisy
-        # If each draw has sequences of noise, closed loops run on fewer tasks.
-        drawn = self._at(learned, np.concatenate([pool[:192] if noisy else pool, learned.executed]))
-        if not learned.study.planner.batched:
-            return drawn  # each further task costs a design of its own
+        drawn = self._at(learned, np.concatenate([pool[: counts.pool], learned.executed]))
         candidates = np.random.default_rng(1).random((CANDIDATES.candidates, space.dimension))
-        # Tasks next to the boundary at which closed loops are run, beside those of the pool.
-        for count in (64,) if noisy else (512,) * max(space.dimension // 2, 1):
+        for count in counts.boundary:
             nearest = boundary_tasks(drawn, evidence, self._threshold, self._confidence, candidates, count)
             drawn = drawn.and_others(self._at(learned, nearest))
         return drawn

@@ -21,18 +21,19 @@ THINKING = "thinking"  #: key in the note of a trial: the speed of the machine, 
 
 @dataclass(frozen=True)
 class TimeShortage:
-    """The evidence of a verdict does not fit into the budget of thinking."""
+    """The evidence of a verdict, or another statement, does not fit into the budget of thinking."""
 
     needed: float  #: seconds that it needs
     budget: float  #: seconds that it may take
     replaced: tuple[str, ...] = ()  #: the stages of choices that were replaced by cheaper ones
+    of: str = "the evidence of a verdict"  #: what does not fit
 
     code: ClassVar[str] = "no_time"  #: of an undecided verdict
 
     def __str__(self) -> str:
         return (
-            f"the evidence of a verdict needs about {self.needed:.2g} s of thinking, and its budget is "
-            f"{self.budget:.2g} s; give --thinking {self.suggested:g} (thinking= in Python)"
+            f"{self.of} needs about {self.needed:.2g} s of thinking, and its budget is {self.budget:.2g} s; give "
+            f"--thinking {self.suggested:g} (thinking= in Python)"
         )
 
     @property

@@ -106,6 +106,8 @@ class Envelope(ShortRepr):
     #: run comes to states like theirs
     irregular: int = 0
     doubt: str | None = None  #: why it is withdrawn; then no task is trusted
+    #: the stages that were replaced by cheaper ones for lack of time, and the seconds that are missing; else None
+    thinking: Mapping[str, Any] | None = None
     units: str = ""  #: the units of the distance
     _surfaces: Surfaces | None = None
     _bounds: Array | None = None
@@ -160,7 +162,7 @@ class Envelope(ShortRepr):
     def to_json(self) -> dict[str, Any]:
         """Return the statement and its numbers, ready for JSON."""
         first = "threshold confidence units statement words share interpolated regions tasks factor raised_by margin"
-        names = f"{first} evaluated checks uncovered executions tests assumptions irregular doubt".split()
+        names = f"{first} evaluated checks uncovered executions tests assumptions irregular doubt thinking".split()
         plain = {name: getattr(self, name) for name in names} | {"quantile": self.target.to_json()["quantile"]}
         lists = {name: list(value) for name, value in plain.items() if isinstance(value, tuple)}
         lists["regions"] = [region.to_json() for region in self.regions]

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 from rich.table import Table
 
+from ctxval._util.checked import TimeLimit, require
 from ctxval._util.cores import exits_as_exceptions
 from ctxval._util.describe import describe
 from ctxval._util.files import make_folder_of, require_made_by_us
@@ -369,6 +370,19 @@ def print_other_stores(others: list[str]) -> None:
         stores = f"{counted(len(others), 'other store')} of this experiment: {', '.join(others)}"
         why = "The best result of several campaigns is wrong more often than its confidence states."
         out.say(f"the folder contains {stores}. {why}")
+
+
+def stated_seconds(thinking: float | None, usual: float | None) -> float | None:
+    """Return the limit of thinking that a command states, or else the usual one; None for the default."""
+    require("thinking", TimeLimit | None, thinking)
+    return usual if thinking is None else thinking
+
+
+def print_left_out(thinking: Mapping[str, Any] | None) -> None:
+    """Print which stages did not fit into the budget of thinking, of the JSON of a result."""
+    if replaced := (thinking or {}).get("replaced"):
+        stages = "; ".join(replaced)
+        out.say(f"for lack of time, replaced or left out: {stages}. A larger --thinking has time for more.", wrap=True)
 
 
 def print_verdict(verdict: Verdict, units: str = "") -> None:

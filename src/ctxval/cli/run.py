@@ -94,7 +94,7 @@ def run(
         bound = None if verdict is None else verdict.certificate
         if verdict is None and not settings.explores:
             with suppress(CertificateError):
-                bound = campaign.certify(certificate=certificate)
+                bound = campaign.certify(certificate=certificate, thinking=settings.thinking)
         report: dict[str, Any] = {"case": experiment.name, "search": settings.search.type, "seed": settings.seed}
         report |= {"budget": total, "units": experiment.units, **_summary(campaign, verdict, bound)}
         report |= {"store": str(path), "other_stores": [str(other.path) for other in other_stores(path)]}
@@ -102,7 +102,9 @@ def run(
         report |= {} if campaign.sensitivity is None else {"sensitivity": campaign.sensitivity.to_json()}
         trusted = None
         if envelope and limit is not None:
-            trusted = campaign.envelope(limit, certificate.confidence, certificate=certificate)
+            trusted = campaign.envelope(
+                limit, certificate.confidence, certificate=certificate, thinking=settings.thinking
+            )
             report["envelope"] = trusted.to_json()
         result = {"verdict": None if verdict is None else verdict.to_json(), "budget": total}
         if with_report:
@@ -173,6 +175,8 @@ def _print_result(
         print_table({"certificate": bound.doubt or bound.statement})
     elif verdict is None and report["controllers"]:  # a verdict says it
         out.say(f"{report['controllers']}.", wrap=True)
+    if bound is not None:
+        base.print_left_out(bound.details.get("thinking"))
     base.print_failures(report["failures"])
     failed = f", of which {report['failed']} failed" if report["failed"] else ""
     rows = {"executions": f"{report['executions']} of at most {report['budget']}{failed}"}

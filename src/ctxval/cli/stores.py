@@ -12,7 +12,6 @@ from typing import Any
 from ctxval import report as reports
 from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.files import write_text
-from ctxval._util.progress import stage
 from ctxval.campaign.storage.other_stores import provenance_of_store
 from ctxval.campaign.storage.store import CAUSE, Store
 from ctxval.certificates import KINDS, CertificateOptions, assess
@@ -60,12 +59,16 @@ class Asked:
     tests: int | None = None
     quantile: float | None = None
     share: float | None = None
+    thinking: float | None = None
     option: list[str] | None = None
 
     def options(self, settings: ExperimentSettings, kind: str | None) -> CertificateOptions:
         given = {name: getattr(self, name) for name in CertificateTable.model_fields if name != "kind"}
         level = settings.confidence if self.confidence is None else self.confidence
         return settings.certificate.options(level, kind=kind, stated=named_values(self.option, **given))
+
+    def seconds(self, settings: ExperimentSettings) -> float | None:
+        return base.stated_seconds(self.thinking, settings.thinking)
 
 
 @command("certify")
@@ -94,9 +97,11 @@ def certify_store(store: Path, asked: Asked, allowed: Allowed, audit: int | None
         if limit is not None:
             campaign.state_threshold(limit)  # before these draws are executed
         campaign.audit(audit)
-    with stage("certifying"):
-        known = provenance_of_store(opened) if campaign is None else campaign.provenance_for(options)
+    known = provenance_of_store(opened)
+    if campaign is None:
         assessment = assess(opened.trials(), options, limit, known)
+    else:
+        assessment = campaign.assessed(limit, options, asked.seconds(settings))
     others, verdict = [str(other.path) for other in known.beside], assessment.verdict
     if verdict is not None:
         base.print_verdict(verdict)
@@ -105,6 +110,8 @@ def certify_store(store: Path, asked: Asked, allowed: Allowed, audit: int | None
     for row in [] if assessment.certificate is None else str(assessment.certificate).split("\n"):
         head, colon, rest = row.partition(":")
         out.say((head, "bold red" if head == "withdrawn" else ""), f"{colon}{rest}", wrap=True)
+    if assessment.certificate is not None:
+        base.print_left_out(assessment.certificate.details.get("thinking"))
     if asked.kind is None and kind == "posterior":  # the verdict of the campaign may differ
         auto = "the campaign was run with the kind auto, which may decide earlier."
         how = f"`ctxval certify {shlex.quote(str(store))} --kind auto`"
@@ -147,7 +154,11 @@ def write_report(
         limit, budget = Limits(asked.threshold).completed_by(loaded.settings, loaded.experiment)
         options = asked.options(loaded.settings, asked.kind)
         context = reports.context_of_campaign(
-            loaded.campaign, threshold=limit, certificate=options, budget=budget, thinking=loaded.settings.thinking
+            loaded.campaign,
+            threshold=limit,
+            certificate=options,
+            budget=budget,
+            thinking=asked.seconds(loaded.settings),
         )
     written = {"report": str(reports.write_page(context, target))}
     if junit is not None:
@@ -172,6 +183,7 @@ def state_envelope(
     confidence: float | None = None,
     tests: int | None = None,
     quantile: float | None = None,
+    thinking: float | None = None,
     out_: Path | None = None,
     force: bool = False,
 ) -> Any:
@@ -180,9 +192,10 @@ def state_envelope(
     limit, _ = Limits(threshold).completed_by(loaded.settings, loaded.experiment)
     if limit is None:
         raise InputError("an envelope needs --threshold: it is the largest acceptable distance.")
-    asked = Asked(confidence=confidence, tests=tests, quantile=quantile)
+    asked = Asked(confidence=confidence, tests=tests, quantile=quantile, thinking=thinking)
     options = asked.options(loaded.settings, loaded.settings.certificate.kind)
-    envelope = loaded.campaign.envelope(limit, options.confidence, certificate=options)
+    seconds = asked.seconds(loaded.settings)
+    envelope = loaded.campaign.envelope(limit, options.confidence, certificate=options, thinking=seconds)
     print_envelope(envelope)
     written = None if out_ is None or not envelope.share else str(envelope.save(out_))
     if written is not None:
@@ -200,20 +213,23 @@ def print_envelope(envelope: Envelope) -> None:
         if envelope.share:
             out.say(f"It assumes: {'; '.join(envelope.assumptions)}.", wrap=True)
         print_table({"executions": f"{envelope.executions}, of which {envelope.tests} were predicted at drawn tasks"})
+    base.print_left_out(envelope.thinking)
 
 
 @command()
-def why(store: Path, allowed: Allowed, most: int = 2) -> Any:
+def why(store: Path, allowed: Allowed, most: int = 2, thinking: float | None = None) -> Any:
     from ctxval.studies.causes import find_causes  # imported here: the other commands do not need it
 
-    campaign = open_store(store, allowed).campaign
+    loaded = open_store(store, allowed)
+    campaign = loaded.campaign
     digest = campaign.store.digest()
-    causes = find_causes(campaign, most=most)
+    causes = find_causes(campaign, most=most, thinking=base.stated_seconds(thinking, loaded.settings.thinking))
     with suppress(StoreError):  # a store that cannot be written has no report with it
         campaign.store.keep_computed(CAUSE, causes.sentence, digest)
     out.say((causes.sentence, "bold" if causes.named else ""), wrap=True)
     if causes.separating_sentence is not None:
         out.say(causes.separating_sentence, wrap=True)
+    base.print_left_out({"replaced": causes.replaced})
     rows = [] if causes.python is None else ["", *causes.python.splitlines()]
     for row in (*rows, *causes.mjcf):
         out.say(row)

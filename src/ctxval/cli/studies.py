@@ -113,6 +113,7 @@ def refine_model(
     out_: Path | None = None,
     force: bool = False,
     confidence: float | None = None,
+    thinking: float | None = None,
     seed: int | None = None,
     option: list[str] | None = None,
 ) -> Any:
@@ -121,8 +122,9 @@ def refine_model(
         raise InputError("--out is not for --method causes: `ctxval why` prints the lines that make its model.")
     require_model_file(out_, [target, allowed.experiment], force=force)
     opened = open_target(target, {"seed": seed, "options": named_values(option) or None}, allowed)
-    chosen = CauseRepair(opened.campaign) if known is None else known
     settings = opened.settings
+    seconds = base.stated_seconds(thinking, settings.thinking)
+    chosen = CauseRepair(opened.campaign, seconds) if known is None else known
     if confidence is not None:
         settings = settings.model_copy(update={"confidence": confidence})
     limit, total = limits.completed_by(settings, opened.experiment)
@@ -146,6 +148,7 @@ def refine_model(
         method=chosen,
         certificate=settings.certificate_options,
         open_round=open_round,
+        thinking=seconds,
         workers=parallel.workers,
         timeout=parallel.timeout,
     )

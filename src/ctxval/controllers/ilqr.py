@@ -49,7 +49,7 @@ class ILQR(QuadraticSynthesizer):
         Q, R, Q_final: weights of the state, the input and the last state (Q by default), as diagonals or as matrices.
         iterations: largest number of steps for one task.
         tolerance: the iteration stops if the next step would lower the cost by less than this fraction of it.
-        limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
+        limits: limits of the inputs, rows ``[low, high]`` for each, or one number h for ``[-h, h]`` of all.
     """
 
     def __init__(

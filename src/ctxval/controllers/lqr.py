@@ -116,7 +116,7 @@ class LQR(QuadraticSynthesizer):
 
     Args:
         Q, R, Q_final: weights of the state, the input and the last state (Q by default), as diagonals or as matrices.
-        limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
+        limits: limits of the inputs, rows ``[low, high]`` for each, or one number h for ``[-h, h]`` of all.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class StationaryLQR(QuadraticSynthesizer):
 
     Args:
         Q, R: weights of the state and the input, as diagonals or as matrices.
-        limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
+        limits: limits of the inputs, rows ``[low, high]`` for each, or one number h for ``[-h, h]`` of all.
     """
 
     def __init__(self, Q: ArrayLike, R: ArrayLike, *, limits: LimitsLike | None = None) -> None:

@@ -35,8 +35,8 @@ class MPC(ShortRepr):
     Args:
         Q, R, Q_final: weights of the state, the input and the last state (Q by default), as diagonals or as matrices.
         steps: number of predicted steps.
-        limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
-        state_limits: limits of the states, in the same forms; infinite for states without limits.
+        limits: limits of the inputs, rows ``[low, high]`` for each, or one number h for ``[-h, h]`` of all.
+        state_limits: limits of the states, written in the same way; infinite for states without limits.
         violation_cost: cost of exceeding the state limits by 1, for each predicted step; None makes them hard.
         iterations: largest number of quadratic programs for one input.
     """

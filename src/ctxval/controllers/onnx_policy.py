@@ -37,7 +37,7 @@ class OnnxPolicy(ShortRepr):
             the task; by default the observations are the states.
         scale: factor of the network's outputs, a number or ``(m,)``: with a scale of 5 a policy in ``[-1, 1]`` drives
             a motor of 5 N m.
-        limits: limits to which inputs are clipped, in a form of :meth:`Limits.of`, such as one number h for -h to h.
+        limits: limits of the inputs, rows ``[low, high]`` for each, or one number h for ``[-h, h]`` of all.
     """
 
     batched = True

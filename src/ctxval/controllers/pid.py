@@ -34,7 +34,7 @@ class PID(ShortRepr):
         components: the indices of the k chosen states.
         bias: inputs that are added, such as those that hold the weight of an arm, a number or ``(m,)``.
         derivative_filter: time constant in seconds of the low-pass filter of the derivative; 0 is no filter.
-        limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
+        limits: limits of the inputs, rows ``[low, high]`` for each, or one number h for ``[-h, h]`` of all.
     """
 
     batched = True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -177,10 +178,13 @@ class Limits(ShortRepr):
 
     @classmethod
     def of(cls, limits: LimitsLike, inputs: int | None = None) -> Limits:
-        """Return limits from any form that users may give; single numbers are expanded if ``inputs`` is given.
+        """Return limits of rows ``[low, high]``, one for each input; a number h stands for ``[-h, h]`` of every input.
 
-        It is one number h for ``-h`` to ``h`` of every input; ``Limits(low=, high=)`` or a mapping of low and high,
-        numbers or ``(m,)``; or rows ``[low, high]``, one for each input.
+        It is expanded if the number of ``inputs`` is given.
+
+        Raises:
+            InputError: if the limits have another form, or if a lower one is not below the upper one.
+            ShapeError: if there are not as many rows as inputs.
         """
         box = limits if isinstance(limits, Limits) else cls(*_ends(limits))
         if inputs is None:
@@ -200,15 +204,13 @@ class Limits(ShortRepr):
 
 
 def _ends(limits: Any) -> tuple[ArrayLike, ArrayLike]:
-    spellings = (
-        "write one number h for -h to h of every input, { low = 0.0, high = 8.0 } (in Python also Limits(low=0.0, "
-        "high=8.0)) with numbers or one for each input, or rows [[low, high], ...], one for each input"
-    )
+    spellings = "write rows [[low, high], ...], one for each input, or one number h for [-h, h] of every input"
     if isinstance(limits, Mapping):
-        if set(limits) != {"low", "high"}:
-            given = ", ".join(map(str, limits)) or "neither"
-            raise InputError(f"limits must have low and high, of which one may be infinite, got {given}; {spellings}.")
-        return limits["low"], limits["high"]
+        with suppress(KeyError, ValueError, InputError):  # other tables
+            ends = [np.atleast_1d(as_floats(name, limits[name])) for name in ("low", "high")]
+            rows = [list(row) for row in zip(*(end.tolist() for end in np.broadcast_arrays(*ends)), strict=True)]
+            spellings = f"write limits = {rows}"
+        raise InputError(f"limits must not be a table, got {dict(limits)}: {spellings}.")
     try:
         array = as_floats("limits", limits)
     except InputError as error:
@@ -221,8 +223,8 @@ def _ends(limits: Any) -> tuple[ArrayLike, ArrayLike]:
     return (array[:, 0], array[:, 1]) if array.ndim else (-array, array)
 
 
-LimitsLike = float | Limits | Mapping[str, ArrayLike] | ArrayLike
-"""One number, ``Limits(low=, high=)``, a mapping of low and high, or rows ``(m, 2)``; see :meth:`Limits.of`."""
+LimitsLike = float | Limits | ArrayLike
+"""Rows ``(m, 2)``, or one number; see :meth:`Limits.of`. Limits that were made of these are taken, too."""
 
 
 def fed_back(K: Array, deviations: Array) -> Array:
@@ -264,7 +266,7 @@ class Policy(ShortRepr):
     Args:
         policy: function of the step's index, the states ``(..., n)`` and the task; returns the inputs ``(..., m)``.
         vectorized: False if the policy takes only one state ``(n,)`` at a time.
-        limits: limits to which inputs are clipped, in a form of :meth:`Limits.of`, such as one number h for -h to h.
+        limits: limits of the inputs, rows ``[low, high]`` for each, or one number h for ``[-h, h]`` of all.
     """
 
     def __init__(

@@ -279,7 +279,7 @@ def context_of_campaign(
         verdict, known = campaign.judged(threshold, options, thinking)
     falsified = verdict is not None and verdict.answer == "falsified"
     if envelope is None and verdict is not None and falsified and has_tests(campaign.recorder, options):
-        envelope = campaign.envelope(verdict.threshold, options.confidence, certificate=options)
+        envelope = campaign.envelope(verdict.threshold, options.confidence, certificate=options, thinking=thinking)
     return ReportContext(
         campaign.name,
         campaign.validation.space,

@@ -25,10 +25,16 @@ class SegmentSettings:
     """Of which predictions evidence is, and how far an outlier counts."""
 
     steps: tuple[int, int] = (1, 6)  # of the predictions
+    most: tuple[int, int] = (600, 120)  # predictions of these numbers of steps
     largest: float = 1e3  # residual that counts, as a multiple of the typical one of M
     draws: int = 4  # of noise
     longer: int = 4  # times as many steps, with which shares are measured if there is noise
     unknown: float = 1e3  # standard deviation of a share that nothing tells
+
+    def part(self, share: float) -> SegmentSettings:
+        """Return the settings of a share of the predictions."""
+        single, several = (max(12, round(share * each)) for each in self.most)
+        return replace(self, most=(single, several))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +60,6 @@ class Segments:
         model: Model,
         runs: Sequence[Trajectory],
         floors: Sequence[Array] | None = None,
-        most: tuple[int, int] = (600, 120),
         settings: SegmentSettings = SegmentSettings(),
         known: tuple[Effect, ...] = (),
         numbers: Sequence[int] | None = None,
@@ -69,7 +74,7 @@ class Segments:
         self.windows, self.sizes = list[Predictions](), list[Array]()
         self._missed = dict[int, tuple[Array, Mask]]()  # by M after a number of steps, and which of it is evidence
         for number, length in enumerate(settings.steps):
-            window = self._window(min(length, min(self.horizons)), most[number])
+            window = self._window(min(length, min(self.horizons)), settings.most[number])
             left = self.left_by(ModelWithEffects(model, ()), window)
             changes = _size(self._gap(self.states[window.states + window.steps], self.states[window.states]))
             # Smaller residuals are no segments.

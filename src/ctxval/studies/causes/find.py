@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -33,25 +33,10 @@ from ctxval.learning.effects.uncertain import UncertainEffects
 from ctxval.learning.extended import estimates_by_loops_on_model
 from ctxval.learning.input_effects import input_candidates
 from ctxval.learning.parameter_posterior import ParameterSettings, most_probable
+from ctxval.learning.stage_costs import Ledger
 from ctxval.models import MuJoCo
+from ctxval.studies.causes.budget import CauseCosts, CauseSettings, fitting_settings
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
-
-
-@dataclass(frozen=True)
-class CauseSettings:
-    """How many causes are tried, and how much of the deviations of M they must explain."""
-
-    named: float = 0.98  # share of the squared deviations of M in closed loop that causes must explain, to be the cause
-    little: float = 0.1  # share of the squared deviations that is not worth a sentence
-    alike: float = 10.0  # differences of the criterion that do not tell causes apart
-    fitted: int = 8  # explanations by one more cause that are fitted to all records
-    checked: int = 4  # explanations that are tried in closed loop
-    executions: int = 8  # that are explained at most
-    failed: int = 4  # executions among them that failed
-    away: float = 30.0  # ranges of the states that M predicted, beyond which a failed execution says nothing of M
-    steps: int = 5  # of a failed execution
-    # Prior deviations from M, and deviations of the posterior, by which an uncertain parameter of M must differ
-    differs: tuple[float, float] = (0.02, 3.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +143,9 @@ class ClosedLoops:
         return np.inf
 
 
-def find_causes(campaign: Campaign, *, most: int = 2, settings: CauseSettings = CauseSettings()) -> CauseReport:
+def find_causes(
+    campaign: Campaign, *, most: int = 2, thinking: float | None = None, settings: CauseSettings | None = None
+) -> CauseReport:
     """Return what M lacks, found in the executions of a campaign. Nothing is executed.
 
     Every cause of the dictionary is fitted alone, and then each beside the best one. The Bayesian information criterion
@@ -168,12 +155,17 @@ def find_causes(campaign: Campaign, *, most: int = 2, settings: CauseSettings = 
 
     Args:
         most: the largest number of causes together.
+        thinking: seconds of CPU, as in :meth:`ctxval.Campaign.verdict`. Fewer executions are read, and stages left out,
+            if the search does not fit; the report says so.
         settings: how many causes are tried, and what they must explain.
 
     Raises:
-        InputError: if there are fewer than two executions with trajectories, or if they do not say enough.
+        InputError: if there are fewer than two executions with trajectories, if they do not say enough, or if even the
+            smallest search does not fit into ``thinking``.
     """
     validation = campaign.validation
+    ledger = campaign.recorder.dynamics.ledger_of_decision(thinking, campaign.trials)
+    settings = fitting_settings(ledger, settings or CauseSettings())
     trials = sorted(executed_trials(campaign.store, campaign.trials), key=lambda pair: -(pair[0].distance or 0.0))
     failed = list[tuple[Trial, Trajectory]]()
     for trial in () if validation.outputs.hide_states else campaign.failed:
@@ -199,7 +191,8 @@ def find_causes(campaign: Campaign, *, most: int = 2, settings: CauseSettings = 
         plan = validation.plan
         executions = [ExecutedTask(plan(validation.space.from_unit(point)), run) for point, run in executed]
         kind = _EstimatedStudy if validation.outputs.hide_states else _Study
-        return replace(kind(validation, executions, states, settings).report(most), failed=len(failed))
+        report = kind(validation, executions, states, settings, ledger).report(most)
+        return replace(report, failed=len(failed), replaced=tuple(ledger.replaced))
 
 
 class _Study:
@@ -208,10 +201,15 @@ class _Study:
     estimated: ClassVar[bool] = False
 
     def __init__(
-        self, validation: Validation, executions: list[ExecutedTask], runs: list[Trajectory], settings: CauseSettings
+        self,
+        validation: Validation,
+        executions: list[ExecutedTask],
+        runs: list[Trajectory],
+        settings: CauseSettings,
+        ledger: Ledger,
     ) -> None:
         self.validation, self.executions, self.model, self.runs = validation, executions, validation.model, runs
-        self.settings = settings
+        self.settings, self.ledger = settings, ledger
         horizon = min(len(run.inputs) for run in runs)
         # What inputs and jumps of the records tell is known, and not fitted.
         old = observation_delay([(each.plan.controller, each.plan.task, each.executed) for each in executions])
@@ -220,10 +218,10 @@ class _Study:
             following = [np.asarray(self.model.step(*map(np.array, (run.states[:-1], run.inputs)))) for run in runs]
         self.known = (*late, *wrapped_angles([run.states for run in runs], following))
         known = tuple(each.effect for each in self.known)
-        taken = self._segments_of(horizon)
+        taken = self._segments_of(horizon).part(settings.segments)
         self.segments = Segments(self.model, runs, settings=taken, known=known)
         floors = [window.floors for window in self.segments.windows]
-        self.some = Segments(self.model, runs, floors, (200, 40), taken, known)  # all causes are screened on these
+        self.some = Segments(self.model, runs, floors, taken.part(1 / 3), known)  # all causes are screened on these
         numbers = range(len(runs))
         self.others = [
             Segments(self.model, [runs[k] for k in rest], floors, settings=taken, known=known, numbers=rest)
@@ -273,6 +271,8 @@ class _Study:
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
             while chosen is not None and chosen.counts(self.before) and len(self._fitted(chosen)) < most:
+                if not self._affords("a further cause", CauseCosts.second):
+                    break
                 is_small = chosen.explanation.left < 0.02 and chosen.complete >= self.settings.named
                 if is_small or chosen.complete > 0.99:  # nothing is left for another cause
                     break
@@ -292,6 +292,10 @@ class _Study:
             chosen, alike = first, []
         return self._reported([] if chosen is None else [chosen, *alike], ranked, False)
 
+    def _affords(self, stage: str, of: Callable[[CauseCosts], float]) -> bool:
+        """Return whether an optional stage fits into the budget; it is left out otherwise."""
+        return self.ledger.optional("causes", stage, lambda costs: of(CauseCosts(costs, self.settings)))
+
     def _of_parameters(self) -> Explained | None:
         """Return the uncertain parameters that differ from those of M, with what is found beside them as in verdicts.
 
@@ -299,6 +303,9 @@ class _Study:
         """
         model, plant = self.model, self.plant
         if not isinstance(model, MuJoCo) or not model.uncertain:
+            return None
+        count = len(model.uncertain)
+        if not self._affords("the uncertain parameters of M", lambda costs: costs.parameters(count)):
             return None
         commands, seconds = np.concatenate([run.inputs for run in self.runs]), max(r.times[-1] for r in self.runs)
         late = input_candidates(model, plant.dt, plant.inputs, commands, float(seconds), together=True)
@@ -454,6 +461,8 @@ class _Study:
     def _separating(self, group: Sequence[Explained]) -> Separating | None:
         """Return the task at which the predictions of causes that the executions do not tell apart differ most."""
         best, space = None, self.validation.space
+        if not self._affords("the task that tells causes apart", lambda costs: costs.separating(len(group))):
+            return None
         for point in space.from_unit(np.random.default_rng(0).random((24, space.dimension))):
             try:
                 plan = self.validation.plan(point)

@@ -78,6 +78,7 @@ class CauseReport(ShortRepr):
     from_tasks: float | None = None  #: the largest distance if loops begin where tasks begin; None if it is not known
     separating: Separating | None = None  #: the task that tells causes apart which these executions do not
     ranked: tuple[Explanation, ...] = ()  #: the most probable causes alone, the best one first
+    replaced: tuple[str, ...] = ()  #: stages that were replaced by cheaper ones, or left out, for lack of time
 
     @property
     def causes(self) -> tuple[Effect, ...]:
@@ -199,6 +200,7 @@ class CauseReport(ShortRepr):
             "python": self.python,
             "mjcf": list(self.mjcf),
             "urdf": list(self.urdf),
+            "thinking": {"replaced": list(self.replaced)} if self.replaced else None,
         }
 
     def __repr__(self) -> str:

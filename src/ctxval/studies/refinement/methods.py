@@ -112,13 +112,14 @@ class CauseRepair(ShortRepr, Method):
     """The first model with the causes that executions of its campaign name, with sizes fitted to all executions."""
 
     campaign: Campaign
+    thinking: float | None = None  #: seconds, as in ``find_causes``
     name: str = field(default="causes", init=False)
     makes = ModelWithEffects
 
     @functools.cached_property
     def report(self) -> CauseReport:
         """The causes, which a model can have."""
-        report = find_causes(self.campaign)
+        report = find_causes(self.campaign, thinking=self.thinking)
         if report.repaired is None:
             raise InputError(f"no cause is known that a model could have. {report.sentence}")
         if not report.repaired.complete:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.checked import PositiveFloat, PositiveInt, checked
+from ctxval._util.checked import PositiveFloat, PositiveInt, TimeLimit, checked
 from ctxval._util.progress import progress_shown, stage
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import at_points, executed_trials
@@ -47,6 +47,7 @@ def refine(
     certificate: CertificateOptions | None = None,
     on_trial: Callable[[Trial], None] | None = None,
     open_round: Callable[[Validation, Path, Path, CertificateOptions], Campaign] | None = None,
+    thinking: TimeLimit | None = None,
     progress: bool | None = None,
     **execution: Any,
 ) -> Refinement:
@@ -72,8 +73,14 @@ def refine(
         on_trial: called with each trial that has ended.
         open_round: makes the campaign of a round from its validation, its store, the file of its model and its options,
             if the store and the model are files; by default, it is like the given campaign.
+        thinking: seconds of CPU for each choice and verdict, as in :meth:`ctxval.Campaign.run`; a model is learned
+            whole.
         progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
         execution: ``workers``, ``executor`` and ``timeout`` of :meth:`ctxval.Campaign.run`.
+
+    Raises:
+        InputError: if the budget does not exceed the executions of the campaign, if the method is unknown, or if the
+            executions teach no model.
     """
     if budget < campaign.executions:
         raise InputError(
@@ -81,7 +88,7 @@ def refine(
             "more."
         )
     chosen, options = method_of(method, seed=campaign.seed), certificate or CertificateOptions()
-    execution |= {"on_trial": on_trial, "progress": progress}
+    execution |= {"on_trial": on_trial, "progress": progress, "thinking": thinking}
     with progress_shown(progress):
         return _Loop(campaign, float(threshold), budget, chosen, options, open_round, execution).run()
 
@@ -142,7 +149,7 @@ class _Loop:
         left = self.budget - self.spent
         if not falsified and not getattr(campaign.validation.system, "manual", False) and left >= 1:
             campaign.run(left, self.threshold, certificate=options, **self.execution)
-        return campaign.verdict(self.threshold, certificate=options)
+        return campaign.verdict(self.threshold, certificate=options, thinking=self.execution["thinking"])
 
     def _why_ended(self) -> str | None:
         """Return why there is no further round; None if there is one."""
