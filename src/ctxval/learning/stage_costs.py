@@ -248,9 +248,8 @@ class Costs:
         return self._own(self._density() * (4 * 140 + 2 * 80 + guesses))
 
     def friction(self) -> float:
-        """Return the seconds of two searches for dry friction, and of learning with what each finds."""
-        one = self._own(0.3 + 2e-5 * self.sizes.transitions * self.sizes.states) + self.hyperparameters()
-        return 2 * one + self.posterior()
+        """Return the seconds of a search for dry friction, and of learning with it."""
+        return self._own(0.3 + 2e-5 * self.sizes.transitions * self.sizes.states) + self.hyperparameters()
 
     # Noise and histories
 

@@ -9,6 +9,7 @@ with its parts.
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -17,7 +18,6 @@ import numpy as np
 
 from ctxval._util.arrays import Mask, Rows, single_threaded
 from ctxval.errors import InputError
-from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.effects.dry_friction import DryFriction, FrictionSettings, found_friction
 from ctxval.learning.effects.effect import EffectCandidate
 from ctxval.learning.effects.inputs import InputEffects
@@ -54,7 +54,7 @@ class StructureSettings:
 
     inputs: PartLimits = PartLimits(3, 0.02, 0.95)  # the evidence decides
     friction: PartLimits = PartLimits(4, 0.1, 0.5)
-    friction_beside: float = 0.95  # share, of friction that is found beside a Gaussian process: its evidence decides
+    friction_beside: PartLimits = PartLimits(4, 0.1, 0.95)  # beside a Gaussian process; its evidence decides
     data: PartLimits = PartLimits(3, 0.1, 1 / 3, 0.1)
     parameter: PartLimits = PartLimits(6, 0.1, 1 / 3, 0.1)
     enough: float = 0.02  # left-out error below which no further part is compared
@@ -72,10 +72,9 @@ class Part:
     name: str  # as the budget of thinking names it
     limits: PartLimits
     seconds: Callable[[Costs], float]
-    # how a study with it is made, or None if it explains nothing, and which share of errors it must leave at most:
-    # the first way that explains enough
-    ways: tuple[tuple[Callable[[DynamicsStudy, Executed], DynamicsStudy | None], float], ...]
+    add: Callable[[DynamicsStudy, Executed], DynamicsStudy | None]  # a study with it; None if it explains nothing
     has: Callable[[DynamicsStudy], bool]
+    last: bool = False  # whether it is tried only if no other one explains enough
 
 
 class StructureSearch:
@@ -85,24 +84,23 @@ class StructureSearch:
         self.plain, self.settings = plain, settings
         self._known: dict[bytes, DynamicsStudy] = {}
         names, single = len(plain.given.space.units) + 1, settings.input_effects.single
-        friction = Part(
-            "dry friction", settings.friction, Costs.friction,
-            ((self.with_friction, settings.friction.share), (self.with_friction_beside, settings.friction_beside)),
-            lambda study: bool(study.within_steps),
-        )  # fmt: skip
+        friction = [
+            Part(
+                "dry friction", limits, Costs.friction,
+                functools.partial(self.with_friction, beside=beside), lambda study: bool(study.within_steps), beside,
+            )
+            for limits, beside in ((settings.friction, False), (settings.friction_beside, True))
+        ]  # fmt: skip
         self.parts = [
             Part(
                 "inputs that act late", settings.inputs, lambda costs: costs.input_effects(single),
-                ((self.with_inputs, settings.inputs.share),), lambda study: bool(study.of_inputs),
+                self.with_inputs, lambda study: bool(study.of_inputs),
             ),
-            *([] if plain.given.outputs.hide_states else [friction]),
-            Part(
-                "the data of M", settings.data, Costs.learning,
-                ((_without_data, settings.data.share),), lambda study: not study.with_data,
-            ),
+            *([] if plain.given.outputs.hide_states else friction),
+            Part("the data of M", settings.data, Costs.learning, _without_data, lambda study: not study.with_data),
             Part(
                 "parameters that change the dynamics", settings.parameter, lambda costs: names * costs.learning(),
-                ((lambda study, executed: most_telling(study, executed)[0], settings.parameter.share),),
+                lambda study, executed: most_telling(study, executed)[0],
                 lambda study: len(study.given.physical) > len(plain.given.physical),
             ),
         ]  # fmt: skip
@@ -139,19 +137,19 @@ class StructureSearch:
             best: tuple[float, LearnedDynamics] | None = None
             if learned is None:
                 break
-            for part in asked:
+            for part in sorted(asked, key=lambda part: part.last):
                 limits = part.limits
                 if part.has(study) or len(executed) < limits.after or not learned.left_out_error > limits.error:
                     continue
-                for add, share in part.ways:
-                    tried = add(study, executed)
-                    found = None if tried is None else tried.learned_alone(executed)
-                    left = np.inf if found is None else share_left(found, learned, self.settings)
-                    if found is not None and left < share and found.left_out_error < limits.most:
-                        best = (left, found) if best is None or left < best[0] else best
+                tried = None if part.last and best is not None else part.add(study, executed)
+                found = None if tried is None else tried.learned_alone(executed)
+                if found is None:
+                    continue
+                left = share_left(found, learned, self.settings)
+                if left < limits.share and found.left_out_error < limits.most and (best is None or left < best[0]):
+                    best = left, found
+                    if found.left_out_error < self.settings.enough:
                         break
-                if best is not None and best[1].left_out_error < self.settings.enough:
-                    break
             if best is None:
                 break
             learned = best[1]
@@ -206,26 +204,21 @@ class StructureSearch:
 
     def _with_friction_again(self, study: DynamicsStudy, executed: Executed, before: Found) -> DynamicsStudy:
         """Return a study with dry friction as it was found before, with sizes for these executions."""
-        beside = any(isinstance(each.effect, DryFriction) and each.effect.beside_process for each in before)
-        found = (self.with_friction_beside if beside else self.with_friction)(study, executed)
-        return found or study.made(effects=(*study.effects, *before))
+        beside = any(isinstance(each.effect, DryFriction) and each.effect.beside for each in before)
+        return self.with_friction(study, executed, beside) or study.made(effects=(*study.effects, *before))
 
-    def with_friction_beside(self, study: DynamicsStudy, executed: Executed) -> DynamicsStudy | None:
-        """Return a study with the dry friction that executions show beside the smooth part that was learned of them."""
-        learned = study.made(effects=study.of_inputs).learned_alone(executed)
-        return None if learned is None else self.with_friction(study, executed, learned.posterior)
-
-    def with_friction(
-        self, study: DynamicsStudy, executed: Executed, beside: DynamicsPosterior | None = None
-    ) -> DynamicsStudy | None:
-        """Return a study with the dry friction that executions show, beside a linear function or a given process."""
+    def with_friction(self, study: DynamicsStudy, executed: Executed, beside: bool = False) -> DynamicsStudy | None:
+        """Return a study with the dry friction that executions show, which may be hidden beside what M misses."""
         extended, model = study.extended.executions(executed), before_refinement(study.validation.model)
         recorded = study.transitions_of(extended, with_data=False) if extended else None
+        learned = study.made(effects=study.of_inputs).learned_alone(executed) if beside else None
+        if recorded is None or (beside and learned is None):
+            return None
         friction, settings = None, self.settings.dry_friction
-        prior = None if beside is None else beside.prior
+        prior = None if learned is None else learned.posterior.prior
         # Least squares may fail, and so may the factor of a covariance.
         with single_threaded(), np.errstate(all="ignore"), contextlib.suppress(RuntimeError, InputError):
-            friction = None if recorded is None else found_friction(model, recorded[0], settings, prior)
+            friction = found_friction(model, recorded[0], settings, prior)
         if friction is None:
             return None
         return study.made(effects=(*study.of_inputs, EffectCandidate(friction)))

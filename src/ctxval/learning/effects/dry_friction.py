@@ -103,7 +103,7 @@ class DryFriction(Effect, SettlingModel):
     rest: Array  # the largest friction at rest against pushes below and above 0 (2, m), or of draws (S, 1, 2, m)
     passed: Array  # the largest friction that holds a joint as it turns (m,)
     settings: FrictionSettings = FrictionSettings()
-    beside_process: bool = False  # whether it was found beside a Gaussian process, and not a linear function
+    beside: bool = False  # whether it was found beside a Gaussian process, and not a linear function
     told: AtRest | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -344,7 +344,7 @@ def found_friction(
         rest=np.stack([largest[0] + excess] * 2),
         passed=np.full(m, np.inf),
         settings=settings,
-        beside_process=factor is not None,
+        beside=factor is not None,
     )
 
 
