@@ -154,7 +154,7 @@ def measured(threshold: float, budget: int, **parts: Any) -> dict[str, Any]:
         "choices": choices,
         "bound": verdict.bound,
         "reason": verdict.reason[:300],
-        "notes": [(trial.note or {}).get("thinking") for trial in campaign.trials],
+        "notes": [trial.note.thinking for trial in campaign.trials],
         "shortage": getattr(verdict, "shortage", None),
     }
 

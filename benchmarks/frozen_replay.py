@@ -28,6 +28,7 @@ from ctxval import Campaign, Trajectory
 from ctxval._util.arrays import single_threaded
 from ctxval.campaign.storage.store import Store
 from ctxval.core.trial import Trial
+from ctxval.core.trial_note import TrialNote
 from freeze import ENDING, FROZEN, call, outcome, read, search_of, validation_of
 from json_lines import JsonLines
 
@@ -80,11 +81,11 @@ def loaded(frozen: Mapping[str, Any], count: int | None = None) -> Campaign:
 
 def _trial(one: Mapping[str, Any], experiment: str) -> Trial:
     known = {name: value for name, value in one.items() if name not in ("point", "note", "run")}
-    note = None if one["note"] is None else dict(one["note"])
-    if note is not None and "prediction" in note:
+    note = dict(one["note"] or {})
+    if "prediction" in note:
         # It belongs to the present distance, however a validation describes itself by now.
         note["prediction"] = {**note["prediction"], "experiment": experiment}
-    return Trial(unit_point=np.array(one["point"]), note=note, **known)
+    return Trial(unit_point=np.array(one["point"]), note=TrialNote.from_json(note), **known)
 
 
 def _trajectory(run: Mapping[str, Any] | None) -> Trajectory | None:

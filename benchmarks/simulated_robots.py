@@ -409,7 +409,7 @@ def bullet(changes: Table) -> Validation:
 
 PUSHED = """<mujoco><option timestep="0.004" cone="elliptic" integrator="implicitfast" iterations="50"/>
 <worldbody><geom name="table" type="plane" size="2 2 .1" friction=".4 .005 .0001"/>
-<body name="box" pos="0 0 .03" simple="false"><freejoint/>
+<body name="box" pos="0 0 .03"><freejoint/>
 <geom type="box" size=".05 .05 .03" mass=".3" friction=".4 .005 .0001"/></body>
 <body name="finger" pos="-.12 0 .03"><joint name="x" type="slide" axis="1 0 0" damping="5"/>
 <joint name="y" type="slide" axis="0 1 0" damping="5"/>

@@ -87,7 +87,7 @@ def campaign(validation: Validation, search: searches.Search, seed: int, budget:
         "truth": best_known,
         "budget": budget,
         "distances": [trial.distance for trial in running.trials],
-        "notes": [trial.note for trial in running.trials],
+        "notes": [trial.note.to_json() or None for trial in running.trials],
         "points": [[round(x, 4) for x in trial.unit_point.tolist()] for trial in running.trials],
         "seconds": (time.process_time() - started) / len(running.trials),
     }

@@ -76,7 +76,7 @@ def study(seed: int) -> dict[str, Any]:
         "worst": worst.distance,
         "typed_again": typed(validation, worst.parameters),
         "beside": max(typed(validation, worst.parameters, moved) for moved in (1e-10, -1e-10)),
-        "rejected": sum((trial.note or {}).get("unsteady", 0) for trial in campaign.trials),
+        "rejected": sum(trial.note.unsteady or 0 for trial in campaign.trials),
         "executions": campaign.executions,
         "verdicts": {str(share): campaign.verdict(share * largest, certificate=options).answer for share in (0.9, 1.1)},
         "until_decided": {str(share): decided(validation, share * largest, seed) for share in (0.9, 1.1)},

@@ -44,7 +44,7 @@ def study(run: tuple[int, str, str]) -> dict[str, Any]:
         "seed": seed,
         "search": search,
         "distances": [None if trial.distance is None else trial.distance / largest for trial in campaign.trials],
-        "notes": [trial.note for trial in campaign.trials],
+        "notes": [trial.note.to_json() or None for trial in campaign.trials],
         "seconds": round(time.process_time() - started, 1),
     }
 

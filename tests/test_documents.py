@@ -14,7 +14,6 @@ import pytest
 
 from conftest import evidence_on, make_validation
 from ctxval import Campaign, refine, searches, systems
-from ctxval.campaign.dynamics import PREDICTION
 from ctxval.certificates import (
     KINDS,
     AnytimeAudit,
@@ -121,7 +120,7 @@ def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
         DistanceBound().certify_drawn(sample, draw_maxima(sample, draws=4, paths=2), 0.5),
     ]
     used = set().union(*(keys(certificate.to_json()) for certificate in certificates))
-    used |= keys({PREDICTION: ExecutionPrediction(1, (0.5,), 0.1, (1,), ((0.0,),), ((0.1,),), 0.0).to_json()})
+    used |= keys({"prediction": ExecutionPrediction(1, (0.5,), 0.1, (1,), ((0.0,),), ((0.1,),), 0.0).to_json()})
     used |= {*get_args(Origin), *get_args(State), *KINDS, "validated", "falsified", "undecided"}
     explained = words()
     explained += re.findall(r"^\| `([^`]+)` \|", (ROOT / "docs" / "parts.md").read_text(), re.MULTILINE)  # added kinds

@@ -8,7 +8,9 @@ import inspect
 import re
 import subprocess
 import sys
+import textwrap
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -71,6 +73,46 @@ def test_a_type_checker_sees_the_same_names() -> None:
     assert modules == ctxval._MODULES
     assert {name: module for (name, asname), module in imported.items() if not asname} == ctxval._LAZY
     assert list(ctxval._LAZY) == ctxval.__all__
+
+
+def test_the_exceptions_that_public_functions_raise_themselves_are_documented() -> None:
+    """What they call may raise more; a constructor documents its own in the docstring of the class."""
+    missing = set()
+    for package in PACKAGES:
+        module = importlib.import_module(f"ctxval{package}")
+        for name in getattr(module, "__all__", ()):
+            value = inspect.unwrap(getattr(module, name)) if callable(getattr(module, name)) else None
+            if not getattr(value, "__module__", "").startswith("ctxval"):
+                continue
+            if inspect.isfunction(value):
+                missing |= {(name, each) for each in raised_in(value) - documented(value.__doc__)}
+            for method in vars(value).values() if inspect.isclass(value) else ():
+                function = inspect.unwrap(getattr(method, "fget", None) or getattr(method, "__func__", method))
+                if inspect.isfunction(function):
+                    made = function.__name__ in ("__init__", "__post_init__", "__call__")
+                    text = value.__doc__ if made else function.__doc__  # without one, it is that of its contract
+                    written = inspect.getsourcefile(function) == inspect.getsourcefile(value)  # not by `dataclass`
+                    if written and text and (made or not function.__name__.startswith("_")):
+                        missing |= {(function.__qualname__, each) for each in raised_in(function) - documented(text)}
+    assert not missing
+
+
+def raised_in(function: Callable[..., object]) -> set[str]:
+    """Return the names of the package's exceptions that the body of a function raises itself."""
+    pending: list[ast.AST] = list(ast.parse(textwrap.dedent(inspect.getsource(function))).body[0].body)  # type: ignore[attr-defined]
+    found = set()
+    while pending:
+        node = pending.pop()
+        if isinstance(node, ast.FunctionDef | ast.Lambda | ast.ClassDef):
+            continue
+        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and isinstance(node.exc.func, ast.Name):
+            found.add(node.exc.func.id)
+        pending += ast.iter_child_nodes(node)
+    return {name for name in found if hasattr(errors, name)}
+
+
+def documented(text: str | None) -> set[str]:
+    return set(re.findall(r"\b[A-Z]\w*Error\b", (text or "").partition("Raises:")[2]))
 
 
 @pytest.mark.parametrize("name", list(ctxval.__all__))

@@ -15,6 +15,7 @@ from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controller
 from ctxval._util.arrays import Array
 from ctxval.certificates import RESOLUTION, CertificateOptions, DistanceBound, farthest_task
 from ctxval.core.trial import Trial
+from ctxval.core.trial_note import NO_NOTE
 from ctxval.errors import (
     CampaignError,
     CertificateError,
@@ -706,13 +707,13 @@ def test_independent_draws_know_how_many_there_were_to_be(validation: Validation
     campaign = Campaign(validation, search=searches.GPUCB(initial=2)).run(3)
     campaign.audit(2)
     campaign.audit(3)
-    assert [trial.note for trial in campaign.trials[3:]] == [{"draws": 2}, {"draws": 2}, {"draws": 3}]
-    assert all(trial.note is None for trial in campaign.trials[:3])
+    assert [trial.note.draws for trial in campaign.trials[3:]] == [2, 2, 3]
+    assert all(trial.note == NO_NOTE for trial in campaign.trials[:3])
     campaign.tell(campaign.ask(draw=True), distance=0.1)
-    assert campaign.trials[-1].note is None
+    assert campaign.trials[-1].note == NO_NOTE
     drawn = Campaign(validation, search=searches.Random()).run(2).run(4, 90.0, resolution=1.0)
-    assert [(trial.note or {}).get("draws") for trial in drawn.trials] == [2, 2, 0, 0]
-    assert Campaign(validation, search=searches.Random()).run(2, until=lambda _: False).trials[0].note == {"draws": 0}
+    assert [trial.note.draws for trial in drawn.trials] == [2, 2, 0, 0]
+    assert Campaign(validation, search=searches.Random()).run(2, until=lambda _: False).trials[0].note.draws == 0
 
 
 def test_a_resumed_random_search_keeps_its_plan(validation: Validation, tmp_path: Path) -> None:
@@ -721,7 +722,7 @@ def test_a_resumed_random_search_keeps_its_plan(validation: Validation, tmp_path
         stopped.run(3, on_trial=lambda _: interrupt_at_once())
     stopped.store.close()
     trials = Campaign(validation, search=searches.Random(), store=tmp_path / "a.sqlite").run(3).trials
-    assert [trial.note for trial in trials] == [{"draws": 3}] * 3
+    assert [trial.note.draws for trial in trials] == [3] * 3
 
 
 @pytest.mark.slow

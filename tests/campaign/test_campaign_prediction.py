@@ -60,7 +60,7 @@ def test_running_in_pieces_equals_running_at_once(tmp_path: Path, with_data: boo
             budget, explore=True
         )
     assert facts(pieces) == facts(whole)
-    assert any(t.note is not None and t.note["engine"] == "climb" for t in whole.trials)
+    assert any(t.note.search is not None and t.note.search["engine"] == "climb" for t in whole.trials)
 
 
 @pytest.mark.slow
@@ -115,7 +115,7 @@ def test_a_note_of_a_task_that_could_not_be_planned_is_kept(tmp_path: Path) -> N
     Fussy.refuses = False
     reopened = Campaign(validation, search=searches.Auto(), store=tmp_path / "a.sqlite")
     assert reopened.trials[0].note == campaign.trials[0].note
-    assert reopened.trials[0].note is not None
+    assert reopened.trials[0].note.prediction is not None
     assert reopened.run(2).executions == 2
 
 

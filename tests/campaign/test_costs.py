@@ -7,6 +7,7 @@ import pytest
 
 from conftest import make_validation
 from ctxval import Campaign, Experiment, Task, Validation, controllers, distances, searches
+from ctxval.campaign.choices import Choice
 from ctxval.campaign.costs import ThinkingCosts
 from ctxval.cli.config.check import check_experiment
 from ctxval.core.controller import Controller
@@ -69,7 +70,7 @@ def test_the_estimate_is_that_of_a_real_suggestion_within_a_factor() -> None:
     validation = make_validation()
     campaign = Campaign(validation, search=searches.Auto("thorough"), seed=1).run(3, explore=True)
     started = time.process_time()
-    campaign.recorder._proposals.next(campaign.trials)
+    campaign.recorder._proposals.next(campaign.trials, Choice())
     real = time.process_time() - started
     estimated = costs(validation).suggestion
     assert estimated is not None

@@ -47,7 +47,7 @@ def test_if_both_end_the_distance_is_that_of_the_common_part(tmp_path: Path) -> 
         steps = int(np.ceil((1.55 - start) / 0.11 - 1e-9))
         common = min(steps, int(np.ceil((1.55 - start) / 0.1 - 1e-9)))
         assert trial.distance == pytest.approx(0.01 * min(common, H))
-        assert (trial.note or {}).get("ends", {}).get("system", H * DT) == pytest.approx(DT * min(steps, H))
+        assert (H * DT if trial.note.ends is None else trial.note.ends.system) == pytest.approx(DT * min(steps, H))
     again = Campaign(parts, store=tmp_path / "a.sqlite")
     assert again.trials.distances.tolist() == campaign.trials.distances.tolist()
     assert again.run(6, explore=True).executions == 6

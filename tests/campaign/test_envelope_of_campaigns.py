@@ -13,7 +13,7 @@ from ctxval import Campaign, Store, Task, TaskSpace, Validation, certificates, c
 from ctxval.campaign.envelope import EnvelopeSearch
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.certificates import CertificateOptions
-from ctxval.core.trial import AT_LEAST
+from ctxval.core.trial_note import TrialNote
 from ctxval.errors import InputError
 from facts import assert_names, refuses
 
@@ -70,7 +70,7 @@ def test_a_failure_beyond_the_threshold_is_outside_or_contradicts_it(
     def with_failure(row: int, least: float) -> certificates.Envelope:
         stopped = replace(
             whole.trials[0], number=len(whole.trials), origin="manual", state="failed", distance=None,
-            unit_point=space.to_unit(tasks[row]), note={AT_LEAST: least},
+            unit_point=space.to_unit(tasks[row]), note=TrialNote(at_least=least),
         )  # fmt: skip
         monkeypatch.setattr(whole.recorder, "_trials", [*whole.trials, stopped])
         found = EnvelopeSearch(IntervalSearch(whole.recorder, CertificateOptions(), BUDGET, tau)).envelope()

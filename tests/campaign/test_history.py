@@ -10,6 +10,7 @@ from conftest import make_validation
 from ctxval import Campaign, searches
 from ctxval.campaign.history import history_of
 from ctxval.core.trial import Trial
+from ctxval.core.trial_note import TrialNote
 from rig_thorough import more
 
 
@@ -20,9 +21,9 @@ def trial(number: int, goal: float, distance: float | None = None) -> Trial:
 
 def test_a_point_that_waits_for_its_value_is_in_the_history_once() -> None:
     trials = [trial(0, 0.1), trial(1, 0.2, 2.0), trial(2, 0.1), trial(3, 0.1, 1.0), trial(4, 0.1)]
-    trials[0] = replace(trials[0], note={"first": True})
+    trials[0] = replace(trials[0], note=TrialNote({"first": True}))
     assert [(t.number, t.distance) for t in history_of(trials)] == [(3, 1.0), (1, 2.0), (4, None)]
-    assert history_of(trials)[0].note == {"first": True}
+    assert history_of(trials)[0].note.search == {"first": True}
 
 
 @pytest.mark.slow

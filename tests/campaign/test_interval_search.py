@@ -27,7 +27,7 @@ from ctxval import (
     specs,
     systems,
 )
-from ctxval.campaign.dynamics import NEAR, PREDICTION
+from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.next_task import CandidateFilter, next_task
 from ctxval.certificates import (
@@ -45,9 +45,9 @@ from ctxval.certificates import (
 )
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.limits import LIMITS
-from ctxval.certificates.prediction_tests import DRAWN, TESTS, hypercube_in, share_missed
-from ctxval.certificates.task_share import PREDICTED_ABOVE
+from ctxval.certificates.prediction_tests import DRAWN, TESTS, share_missed
 from ctxval.core.coverage import UntestedRest, UnvisitedRegion
+from ctxval.core.trial_note import NO_NOTE
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning import dynamics_study
 from ctxval.learning.dynamics_posterior import condition
@@ -201,14 +201,14 @@ def test_it_resumes_with_the_same_choices_and_the_same_predictions(tmp_path: Pat
             continue
         break
     assert facts(pieces) == facts(whole)
-    assert any(PREDICTION in (trial.note or {}) for trial in whole.trials)
+    assert any(trial.note.prediction for trial in whole.trials)
 
 
 @pytest.mark.slow
 def test_predictions_are_stored_before_executions_and_equal_those_computed_afterwards(decided: Campaign) -> None:
     dynamics = decided.recorder.dynamics
     stored = dynamics.evidence(decided.trials, 0.95)
-    without = [replace(trial, note=None) for trial in decided.trials]
+    without = [replace(trial, note=NO_NOTE) for trial in decided.trials]
     anew = dynamics.evidence(without, 0.95)
     assert stored is not None
     assert anew is not None
@@ -255,11 +255,11 @@ def test_eight_drawn_tasks_are_executed_before_a_model_is_validated(decided: Cam
     plain = Campaign(validation, seed=2).run(12, 1.1 * largest, certificate=untested)
     assert decided.executions <= plain.executions + TESTS
     assert sum(trial.origin in DRAWN for trial in decided.trials) == TESTS
-    assert all(PREDICTION in (trial.note or {}) for trial in decided.trials if trial.origin in DRAWN)
+    assert all(trial.note.prediction for trial in decided.trials if trial.origin in DRAWN)
     verdict = decided.verdict(1.1 * largest)
     assert verdict.answer == "validated"
     # The hypercube was chosen among many, as one of few that test where distances are large.
-    (chosen,) = (found for trial in decided.trials if (found := hypercube_in(trial.note)))
+    (chosen,) = (found for trial in decided.trials if (found := trial.note.hypercube))
     assert verdict.certificate is not None
     share = verdict.certificate.details["tests"]["share_missed"]
     assert share == share_missed(8, 0, 2, 1 - 0.05 * chosen[1])
@@ -323,7 +323,7 @@ def test_the_posterior_bound_predicts_nothing() -> None:
     campaign = Campaign(make_validation(), seed=1)
     campaign.run(20, 1e3, certificate=CertificateOptions(DistanceBound()))
     assert campaign.verdict(1e3, certificate=CertificateOptions(DistanceBound())).answer == "validated"
-    assert not any(PREDICTION in (trial.note or {}) for trial in campaign.trials)
+    assert not any(trial.note.prediction for trial in campaign.trials)
 
 
 def evidence(upper: float = 1.0, highest: float = 0.9) -> Evidence:
@@ -552,7 +552,7 @@ def test_a_share_of_the_tasks_is_falsified_by_tasks_drawn_where_more_is_predicte
     campaign, threshold = shared(0.9)
     verdict = campaign.verdict(threshold, share=0.99)
     assert verdict.answer == "falsified"
-    drawn = [trial for trial in campaign.trials if PREDICTED_ABOVE in (trial.note or {})]
+    drawn = [trial for trial in campaign.trials if trial.note.predicted_above]
     assert 2 <= len(drawn) <= 4
     assert campaign.trials[-1] in drawn
     assert campaign.verdict(threshold, share=0.8).answer != "falsified"

@@ -54,7 +54,7 @@ def test_a_bound_on_the_quantile_is_validated_and_says_so(tmp_path: Path) -> Non
     assert verdict.certificate is not None
     assert verdict.certificate.details["quantile"] == 0.9
     # The stored predictions of later executions know the noise.
-    noisy = [trial for trial in campaign.trials if ((trial.note or {}).get("prediction") or {}).get("noise")]
+    noisy = [trial for trial in campaign.trials if (trial.note.prediction or {}).get("noise")]
     assert noisy
 
 

@@ -57,7 +57,7 @@ def test_each_task_is_predicted_beforehand_and_a_reopened_store_goes_on(tmp_path
         campaign.tell(opened, case.validation.system.execute(opened.plan.controller, opened.plan.task))
         campaign.store.close()
     assert campaign.verdict(threshold, certificate=options).answer == "validated"
-    assert all(trial.note is not None for trial in campaign.trials)
+    assert all(trial.note.search is not None for trial in campaign.trials)
     assert facts(campaign) == facts(Campaign(case.validation).run(20, threshold, certificate=options))
 
 

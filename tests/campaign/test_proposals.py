@@ -54,7 +54,7 @@ def replace_parts(whole: Validation, system: Any, synthesizer: Any) -> Validatio
 
 
 def designs_of(campaign: Campaign) -> list[int]:
-    return [trial.note["designs"] for trial in campaign.trials if trial.note and "designs" in trial.note]
+    return [trial.note.search["designs"] for trial in campaign.trials if "designs" in (trial.note.search or {})]
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ from ctxval._util.arrays import Array
 from ctxval.campaign.proposals import DesignContinuity
 from ctxval.core.controller import AffineFeedback, Controller
 from ctxval.core.model import Model
-from ctxval.core.trial import UNSTEADY
 from ctxval.errors import InputError
 from ctxval.learning.closed_loops import LoopPlanner
 from facts import refuses
@@ -76,7 +75,7 @@ def test_a_task_is_steady_if_its_neighbours_are_like_it(predicted: bool) -> None
 def test_the_tasks_of_a_search_are_steady(search: searches.Search) -> None:
     campaign = Campaign(accidental(), search=search, seed=2).run(6, explore=True)
     steady = DesignContinuity(LoopPlanner(campaign.validation))
-    rejected = [(trial.note or {}).get(UNSTEADY, 0) for trial in campaign.trials]
+    rejected = [trial.note.unsteady or 0 for trial in campaign.trials]
     assert sum(rejected) > 0 or isinstance(search, searches.Auto)  # which executes bounds here
     assert all(map(steady, (trial.unit_point for trial in campaign.trials)))
     space = campaign.validation.space
@@ -102,7 +101,7 @@ def test_a_resumed_campaign_chooses_the_same_tasks(search: searches.Search, tmp_
 @pytest.mark.parametrize("search", [searches.Random(), searches.GPUCB()])
 def test_independent_draws_and_tasks_of_people_are_never_rejected(search: searches.Search) -> None:
     campaign = Campaign(accidental(), search=search, seed=2).audit(12)
-    assert all(UNSTEADY not in (trial.note or {}) for trial in campaign.trials)
+    assert all(trial.note.unsteady is None for trial in campaign.trials)
     assert all(float(f"{trial.parameters['goal']:.9g}") == trial.parameters["goal"] for trial in campaign.trials)
     goals = [2.123456789012345, 0.1 + 0.2, -1e-7 / 3, 1.9059017468190245]
     for goal in goals:
@@ -128,7 +127,7 @@ def test_if_no_task_is_steady_the_first_one_is_executed() -> None:
     whole = make_validation()
     campaign = Campaign(Validation(**{**vars(whole), "synthesizer": Chaotic()}), search=searches.GPUCB()).run(3)
     assert campaign.executions == 3
-    assert sum((trial.note or {}).get(UNSTEADY, 0) for trial in campaign.trials) > 10
+    assert sum(trial.note.unsteady or 0 for trial in campaign.trials) > 10
 
 
 class Broken:
@@ -151,7 +150,7 @@ def test_a_design_that_fails_is_reported_when_the_task_is_planned(error: BaseExc
 def test_the_note_of_a_search_has_no_keys_of_the_campaign() -> None:
     class Noting(searches.GPUCB):
         def note(self) -> dict[str, Any]:
-            return {UNSTEADY: 3}
+            return {"unsteady": 3}
 
     with refuses(InputError, "search"):
         Campaign(make_validation(), search=Noting()).run(1)
@@ -178,12 +177,10 @@ def test_a_campaign_notes_whether_designs_converged() -> None:
             return Told(super().design(task, model))
 
     hasty = controllers.ILQR([1.0, 0.1], [1e-2], [10.0, 1.0], limits=0.5, iterations=1)
-    for synthesizer, expected in ((hasty, {"converged": False}), (Other([1.0, 0.1], [1e-2]), None)):
+    for synthesizer, expected in ((hasty, False), (Other([1.0, 0.1], [1e-2]), None)):
         validation = Validation(**{**vars(make_validation()), "synthesizer": synthesizer})
         campaign = Campaign(validation, search=searches.Random()).run(2)
-        assert [trial.note and {k: v for k, v in trial.note.items() if k != "draws"} for trial in campaign.trials] == [
-            expected or {}
-        ] * 2
+        assert [trial.note.converged for trial in campaign.trials] == [expected] * 2
 
 
 def switching(t: int, x: Array, task: Task) -> Array:

@@ -57,7 +57,7 @@ def test_a_resumed_random_search_draws_the_same_tasks(tmp_path: Path) -> None:
     Campaign(narrow(), search=searches.Random(), seed=2, store=tmp_path / "a.sqlite").run(3)
     resumed = Campaign(narrow(), search=searches.Random(), seed=2, store=tmp_path / "a.sqlite").run(6)
     np.testing.assert_array_equal(goals(resumed), goals(whole))
-    assert [trial.note for trial in resumed.trials[3:]] == [{"draws": 6}] * 3
+    assert [trial.note.draws for trial in resumed.trials[3:]] == [6] * 3
 
 
 def test_a_store_keeps_it_and_refuses_another_one(tmp_path: Path) -> None:

@@ -11,8 +11,7 @@ import pytest
 
 from conftest import make_validation
 from ctxval import Campaign, Trial
-from ctxval.campaign.dynamics import PREDICTION
-from ctxval.campaign.thinking import THINKING, CampaignThinking
+from ctxval.campaign.thinking import CampaignThinking
 from ctxval.certificates import CertificateOptions
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.stage_costs import Ledger, Speed
@@ -33,11 +32,11 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[Speed]:
 
 
 def thoughts(campaign: Campaign) -> list[dict[str, Any]]:
-    return [(trial.note or {}).get(THINKING, {}) for trial in campaign.trials]
+    return [trial.note.thinking or {} for trial in campaign.trials]
 
 
 def facts(trials: tuple[Trial, ...]) -> list[tuple[Any, ...]]:
-    notes = [{name: value for name, value in (t.note or {}).items() if name != THINKING} for t in trials]
+    notes = [replace(t.note, thinking=None) for t in trials]
     return [(t.unit_point.tobytes(), t.origin, t.distance, str(note)) for t, note in zip(trials, notes, strict=True)]
 
 
@@ -53,7 +52,7 @@ def test_a_budget_that_suffices_changes_nothing(measured: list[Speed]) -> None:
 def test_without_time_for_closed_loops_distances_choose(measured: list[Speed]) -> None:
     measured[0] = SLOW
     campaign = Campaign(make_validation(), seed=0).run(4, 100.0, thinking=1.0)
-    assert all(PREDICTION not in (trial.note or {}) for trial in campaign.trials)
+    assert all(trial.note.prediction is None for trial in campaign.trials)
     assert thoughts(campaign)[1]["replaced"] == ["learned dynamics, by the distances alone"]
     verdict = campaign.verdict(100.0, thinking=1.0)
     assert verdict.answer == "undecided"

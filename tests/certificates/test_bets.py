@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,14 +9,15 @@ from ctxval.certificates.bets import bets_against
 from ctxval.certificates.verdict import counterexample, judge
 from ctxval.core.quantiles import LEVELS, chance_of_more
 from ctxval.core.trial import Trial
+from ctxval.core.trial_note import NO_NOTE, TrialNote
 from facts import assert_names
 
 
 def trial(number: int, distance: float, predicted: np.ndarray | None = None) -> Trial:
-    note: dict[str, Any] | None = None
+    note = NO_NOTE
     if predicted is not None:
         quantiles = np.quantile(predicted, LEVELS).tolist()
-        note = {"prediction": {"noise": {"distances": quantiles, "runs": len(predicted)}}}
+        note = TrialNote(prediction={"noise": {"distances": quantiles, "runs": len(predicted)}})
     point = np.array([0.05 * number])
     return Trial(number, "covering", "completed", point, {"p": point}, distance=distance, note=note)
 
@@ -56,7 +56,7 @@ def test_without_noise_one_execution_falsifies() -> None:
 
 def test_noise_that_is_no_longer_predicted_explains_no_excess_that_repeats_to_the_last_digit() -> None:
     unlikely = np.linspace(0.1, 0.9, 200)
-    silent: dict[str, Any] = {"prediction": {"noise": None, "quantiles": [0.5]}}
+    silent = TrialNote(prediction={"noise": None, "quantiles": [0.5]})
     early, excess = trial(0, 0.5, unlikely), replace(trial(1, 1.2), note=silent)
     again = replace(excess, number=2)
     assert counterexample([early, excess], 1.0) is None

@@ -18,7 +18,6 @@ from conftest import make_validation
 from ctxval import Campaign, certificates, searches
 from ctxval.certificates import (
     KINDS,
-    PLANNED,
     Certificate,
     CertificateKind,
     CertificateOptions,
@@ -28,6 +27,7 @@ from ctxval.certificates import (
 from ctxval.cli import app
 from ctxval.cli.config.settings import CertificateTable
 from ctxval.core.trial import Trial
+from ctxval.core.trial_note import TrialNote
 from ctxval.errors import CertificateError, ConformanceError
 from ctxval.testing import check_certificate
 from facts import assert_names, refuses
@@ -175,7 +175,7 @@ def test_a_verdict_gives_any_kind_only_draws_whose_number_did_not_depend_on_resu
     planned: list[int], trials: int | None
 ) -> None:
     drawn = [
-        Trial(k, "iid", "completed", np.array([0.2 * k]), {"p": 0.2 * k}, distance=0.1 * k, note={PLANNED: draws})
+        Trial(k, "iid", "completed", np.array([0.2 * k]), {"p": 0.2 * k}, distance=0.1 * k, note=TrialNote(draws=draws))
         for k, draws in enumerate(planned)
     ]
     verdict = judge(drawn, 1.0, CertificateOptions(Counting(), 0.9, volume=0.5))

@@ -10,6 +10,7 @@ from ctxval import Trial
 from ctxval.certificates import RecoveredFailure, Sample
 from ctxval.certificates.sample import listed
 from ctxval.core.trial import Origin, State
+from ctxval.core.trial_note import NO_NOTE, TrialNote
 from facts import assert_names
 
 
@@ -20,7 +21,7 @@ def trial(
     state: State | None = None,
     origin: Origin = "acquisition",
     because: str | None = None,
-    note: dict[str, int] | None = None,
+    note: TrialNote = NO_NOTE,
 ) -> Trial:
     ended: State = state or ("failed" if distance is None else "completed")
     return Trial(number, origin, ended, np.array([x]), {"x": x}, 1, True, distance, note=note, because=because)
@@ -86,9 +87,9 @@ def test_the_order_of_a_search_is_kept() -> None:
 
 def test_a_draw_knows_how_many_there_were_to_be() -> None:
     trials = [
-        trial(0, 0.1, 0.3, origin="iid", note={"draws": 59}),
+        trial(0, 0.1, 0.3, origin="iid", note=TrialNote(draws=59)),
         trial(1, 0.2, 0.3, origin="iid"),
-        trial(2, 0.3, 0.3, note={"draws": 7}),
+        trial(2, 0.3, 0.3, note=TrialNote(draws=7)),
     ]
     assert list(Sample.of(trials).planned) == [59, None, None]
     assert list(Sample.of(trials).only("iid").planned) == [59, None]

@@ -9,10 +9,11 @@ from ctxval.certificates import CertificateOptions
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.task_share import PREDICTED_ABOVE, bet_on, bets_on_share
+from ctxval.certificates.task_share import bet_on, bets_on_share
 from ctxval.certificates.verdict import counterexample, judge_by
 from ctxval.core.target import Share
 from ctxval.core.trial import Origin, Trial
+from ctxval.core.trial_note import TrialNote
 from ctxval.errors import InputError
 from rig_evidence import GOOD
 
@@ -21,7 +22,7 @@ TAU, SHARE = 1.0, 0.99
 
 def trial(number: int, distance: float, part: float | None = None, stake: float = 0.8, origin: Origin = "iid") -> Trial:
     point = np.array([0.01 * number])
-    note = None if part is None else {PREDICTED_ABOVE: [TAU, part, stake]}
+    note = TrialNote(predicted_above=None if part is None else (TAU, part, stake))
     origin = origin if part is None else "covering"
     return Trial(number, origin, "completed", point, {"p": point}, distance=distance, note=note)
 

@@ -24,7 +24,8 @@ from ctxval.certificates.covering import RESOLUTION, resolved_volume
 from ctxval.certificates.sentences.withdrawals import REFINED
 from ctxval.certificates.stopping import StoppingRule
 from ctxval.certificates.verdict import counterexample, judge, judge_by
-from ctxval.core.trial import AT_LEAST, Origin, State, StatedThreshold, designs_sentence
+from ctxval.core.trial import Origin, State, StatedThreshold, designs_sentence
+from ctxval.core.trial_note import TrialNote
 from ctxval.errors import InputError
 from facts import assert_names, refuses
 
@@ -57,7 +58,7 @@ def certificate(upper: float, doubt: str | None = None, volume: float = 0.0) -> 
 
 
 def test_the_steps_before_a_failure_falsify_until_a_success_makes_it_good() -> None:
-    stopped = replace(trial(8, 0.35, None), note={AT_LEAST: 0.7}, failure="emergency stop")
+    stopped = replace(trial(8, 0.35, None), note=TrialNote(at_least=0.7), failure="emergency stop")
     low = [replace(each, distance=0.1) for each in trials()]
     verdict = judge([*low, stopped], 0.5)
     assert (verdict.answer, verdict.witness) == ("falsified", stopped)
@@ -103,12 +104,12 @@ def test_a_threshold_is_a_positive_number(threshold: object) -> None:
 # Designs of the controllers
 
 
-def with_notes(notes: list[dict[str, object] | None]) -> list[Trial]:
-    return [replace(one, note=note) for one, note in zip(trials(len(notes)), notes, strict=True)]
+def with_notes(notes: list[dict[str, object]]) -> list[Trial]:
+    return [replace(one, note=TrialNote.from_json(note)) for one, note in zip(trials(len(notes)), notes, strict=True)]
 
 
 def test_a_verdict_says_at_how_many_executed_tasks_the_design_did_not_converge() -> None:
-    known = with_notes([{"converged": True}, {"converged": False}, {"converged": False, "unsteady": 2}, None])
+    known = with_notes([{"converged": True}, {"converged": False}, {"converged": False, "unsteady": 2}, {}])
     sentence = (
         "the design of the controller did not converge at 2 of 3 executed tasks, among them the worst one; 2 tasks "
         "were not executed, because the controller jumps if the task changes by 1e-9 of its range"
@@ -122,14 +123,14 @@ def test_a_verdict_says_at_how_many_executed_tasks_the_design_did_not_converge()
     assert designs_sentence([other, *known[1:]]) == sentence.replace(", among them the worst one", "")
 
 
-@pytest.mark.parametrize("notes", [[None] * 3, [{"converged": True}] * 3, [{"unsteady": "many"}, {}, None]])
-def test_a_verdict_says_nothing_of_designs_that_converged(notes: list[dict[str, object] | None]) -> None:
+@pytest.mark.parametrize("notes", [[{}] * 3, [{"converged": True}] * 3, [{"unsteady": "many"}, {}, {}]])
+def test_a_verdict_says_nothing_of_designs_that_converged(notes: list[dict[str, object]]) -> None:
     assert designs_sentence(with_notes(notes)) is None
     assert "design" not in judge(with_notes(notes), 0.1).reason
 
 
 def test_the_designs_of_open_trials_do_not_count() -> None:
-    waiting = replace(trial(0, 0.1, None, state="open"), note={"converged": False})
+    waiting = replace(trial(0, 0.1, None, state="open"), note=TrialNote(converged=False))
     assert designs_sentence([waiting]) is None
 
 
@@ -464,7 +465,7 @@ def test_a_threshold_chosen_after_looking_is_said_in_the_sentence() -> None:
 
 
 def test_most_kinds_are_handed_countable_draws_only() -> None:
-    drawn = [replace(trial(k, k / 5, 0.1, "iid"), note={"draws": 3 if k < 3 else 6}) for k in range(6)]
+    drawn = [replace(trial(k, k / 5, 0.1, "iid"), note=TrialNote(draws=3 if k < 3 else 6)) for k in range(6)]
     for kind, count in ((Share(), 3), (Audit(), 3), (AnytimeAudit(), 6)):
         verdict = judge(drawn, 0.5, CertificateOptions(kind, 0.5, 0.5))
         assert verdict.certificate is not None

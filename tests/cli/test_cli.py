@@ -88,7 +88,7 @@ def test_the_default_search_learns_from_trajectories(invoke) -> None:  # type: i
     result = CliRunner().invoke(app, ["run", "rig:experiment", "--explore", "--budget", "3", "--no-report", "--json"])
     report = json.loads(result.stdout)
     assert (report["search"], report["store"]) == ("auto", "runs/short-auto-seed0.sqlite")
-    assert Store(Path(report["store"])).trials()[-1].note["engine"] == "climb"  # type: ignore[index]
+    assert Store(Path(report["store"])).trials()[-1].note.to_json()["engine"] == "climb"
 
 
 @pytest.mark.slow

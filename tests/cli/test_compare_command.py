@@ -127,7 +127,7 @@ def trials(folder: Path) -> dict[str, list[tuple[list[float], float | None, str]
             kept = Store(path).trials()
         except StoreError:
             continue
-        found[path.stem] = [(one.unit_point.tolist(), one.distance, json.dumps(one.note)) for one in kept]
+        found[path.stem] = [(one.unit_point.tolist(), one.distance, json.dumps(one.note.to_json())) for one in kept]
     return found
 
 

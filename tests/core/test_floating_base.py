@@ -151,12 +151,12 @@ def test_a_fall_of_s_alone_has_a_distance_and_is_said(stops: bool, tmp_path: Pat
         step = int(np.ceil(0.45 / (0.13 * speed) - 1e-9))
         of_system = 1 - 0.13 * speed * min(step, H)
         assert trial.distance == pytest.approx(abs(of_system - (1 - speed)))
-        fell = (trial.note or {}).get("falls")
+        fell = trial.note.falls
         assert (fell is not None) == (step <= H)
         if fell is not None:
-            assert fell["model"] is None
-            assert fell["system"] == pytest.approx(step * DT)
-    assert any("falls" in (trial.note or {}) for trial in campaign.completed)
+            assert fell.model is None
+            assert fell.system == pytest.approx(step * DT)
+    assert any(trial.note.falls for trial in campaign.completed)
     again = Campaign(parts, store=tmp_path / "a.sqlite")
     assert again.trials.distances.tolist() == campaign.trials.distances.tolist()
     assert again.run(6, explore=True).executions == 6

@@ -78,7 +78,17 @@ def test_an_attribute_beside_the_parameters_is_found_with_them(name: str, true: 
         np.testing.assert_allclose(drawn.step(x, u)[k], alone.step(x[:1], u[:1])[0], atol=1e-9)
 
 
-def test_parameters_of_contacts_are_found_from_single_steps_and_several_starts() -> None:
+def pushed(true: Any) -> list[Trajectory]:
+    """Return two pushes of the box."""
+    runs = []
+    for angle in (-0.2, 0.3):
+        x = np.zeros(15)
+        x[2], x[3], x[6] = 0.03, np.cos(angle / 2), np.sin(angle / 2)
+        runs.append(executed(true, x, np.full((25, 1), 3.0)))
+    return runs
+
+
+def test_parameters_of_contacts_are_found_from_single_steps_and_all_of_the_prior() -> None:
     model = models.MuJoCo(BOX, dt=DT, uncertain={"friction": "20 %", "mass[box]": "20 %", "damping": "20 %"})
 
     def change(compiled: Any) -> None:
@@ -86,12 +96,24 @@ def test_parameters_of_contacts_are_found_from_single_steps_and_several_starts()
         compiled.body("box").mass *= 1.2
         compiled.body("box").inertia *= 1.2
 
-    true, runs = model.changed(change), []
-    for angle in (-0.2, 0.3):
-        x = np.zeros(15)
-        x[2], x[3], x[6] = 0.03, np.cos(angle / 2), np.sin(angle / 2)
-        runs.append(executed(true, x, np.full((25, 1), 3.0)))
-    mode = most_probable(model, runs, (), None, np.random.default_rng(0), SETTINGS)
+    mode = most_probable(model, pushed(model.changed(change)), (), None, np.random.default_rng(0), SETTINGS)
     assert mode is not None
     assert mode.left < 1e-3
     assert values(mode) == pytest.approx({"friction": 0.85, "mass[box]": 1.2, "damping": 1.0}, rel=0.01)
+
+
+def test_a_shift_of_a_centre_of_mass_is_found_with_the_friction_of_contacts() -> None:
+    model = models.MuJoCo(BOX, dt=DT, uncertain={"friction": "20 %", "mass[box]": "20 %"})
+
+    def change(compiled: Any) -> None:
+        compiled.geom_friction[:, 0] *= 0.85
+        compiled.body("box").ipos[0] += 0.012
+
+    runs = pushed(model.changed(change))
+    candidates = [each for each in further_attributes(model, runs) if each.parameters[0].name == "centre of mass"]
+    assert len(candidates) == 3
+    mode = most_probable(model, runs, candidates[:2], None, np.random.default_rng(0), SETTINGS)
+    assert mode is not None
+    assert isinstance(mode.model, UncertainEffects)
+    assert [vars(each.effect)["parameter"] for each in mode.model.effects] == ["centre_x[box]"]
+    assert values(mode) == pytest.approx({"friction": 0.85, "mass[box]": 1.0, "centre of mass": 0.012}, rel=0.01)

@@ -95,3 +95,25 @@ def test_a_draw_is_the_model_with_changed_fields(
 def test_other_names_and_deviations_are_refused(uncertain: dict[str, float | str], facts: tuple[object, ...]) -> None:
     with refuses(InputError, *facts):
         models.MuJoCo(ARM, uncertain=uncertain)
+
+
+FREE = """<mujoco><option timestep="0.005"/><worldbody><body name="ball" pos="0 0 1"><freejoint/>
+<geom type="box" size=".1 .05 .03" mass="1"/></body></worldbody></mujoco>"""
+
+
+def test_the_centre_of_mass_of_a_body_that_mujoco_takes_as_simple_can_move() -> None:
+    plain = models.MuJoCo(FREE)
+    assert plain.compiled.body_simple[1] == 1
+    heavier = plain.changed(lambda compiled: compiled.body_mass.__setitem__(1, 2.0))
+    x, u = np.zeros((1, 13)), np.zeros((1, 0))
+    x[0, 3], x[0, 10] = 1.0, 3.0  # turns about its axis x
+
+    def shift(compiled: Any) -> None:
+        compiled.body_ipos[1, 1] += 0.02
+
+    moved, alone = heavier.changed(shift), plain.changed(shift)
+    assert moved.compiled.body_mass[1] == 2.0
+    assert moved.compiled.body_simple[1] == 0
+    assert np.abs(alone.step(x, u) - plain.step(x, u)).max() > 1e-4
+    drawn = models.MuJoCo(FREE, uncertain={"centre_y": 0.02}).drawn(np.ones((1, 1)))
+    np.testing.assert_allclose(drawn.step(x[None], u[None])[0], alone.step(x, u), atol=1e-12)

@@ -23,6 +23,7 @@ from ctxval import (
 )
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
+from ctxval.core.trial_note import TrialNote
 from faulty_rig import FaultyRig
 
 HOSTILE = "</script><script>document.title='hacked'</script><img src=x onerror=alert(1)>"
@@ -69,7 +70,7 @@ def hostile_store(path: Path) -> Store:
     for number, value in enumerate(values):
         point = np.array([number / 4, 0.5])
         named = {HOSTILE: float(point[0]), "plain": 0.5}
-        note = {"prediction": {"quantiles": HOSTILE}}
+        note = TrialNote(prediction={"quantiles": HOSTILE})
         trial = Trial(number, "acquisition", "open", point, named, because=HOSTILE, note=note)
         store.add([(trial, model, None)])
         states = np.full((4, 2), 1e200 if number == 0 else float(number))

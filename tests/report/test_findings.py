@@ -11,6 +11,7 @@ from rig_pages import pendulum, plane
 from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, searches, systems
 from ctxval._util.arrays import Array
 from ctxval.certificates import CertificateOptions, DistanceBound
+from ctxval.core.trial_note import NO_NOTE
 from ctxval.report import ReportContext, context_of_campaign
 from ctxval.report.distance_model import DistanceModel
 from ctxval.report.findings import Answer, Finding, Question, findings_of, share_far_from_trials, smooth
@@ -270,7 +271,9 @@ def test_neither_smooth_nor_alike_is_good_if_designs_did_not_converge(
     assert weak_motor.designs is not None
     assert_names(weak_motor.designs, 4)
     monkeypatch.setattr(DistanceModel, "calibration", 1.0)
-    sure = found_by(smooth, replace(weak_motor, trials=tuple(replace(trial, note=None) for trial in weak_motor.trials)))
+    sure = found_by(
+        smooth, replace(weak_motor, trials=tuple(replace(trial, note=NO_NOTE) for trial in weak_motor.trials))
+    )
     doubted = found_by(smooth, weak_motor)
     assert sure is not None
     assert doubted is not None

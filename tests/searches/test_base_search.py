@@ -100,7 +100,7 @@ def test_a_campaign_takes_any_search_of_three_methods(search: Search, tmp_path: 
     resumed = Campaign(make_validation(), search=search, store=tmp_path / "a.sqlite").run(5)
     assert campaign.search is search
     assert [trial.origin for trial in resumed.trials] == ["acquisition"] * 5
-    assert all(trial.note is None for trial in resumed.trials)
+    assert all(trial.note.search is None for trial in resumed.trials)
     assert resumed.worst is not None
     assert resumed.estimate == resumed.worst.distance
     mean, _ = resumed.surrogate().predict(np.array([trial.unit_point for trial in resumed.trials]))
@@ -112,8 +112,8 @@ def test_what_a_subclass_has_of_its_own_reaches_the_campaign(tmp_path: Any) -> N
     search = Noting()
     resumed = Campaign(make_validation(), search=search, store=tmp_path / "a.sqlite")
     assert [trial.origin for trial in resumed.trials] == ["iid", "iid"]
-    assert [trial.note["told"] for trial in resumed.trials if trial.note] == [0, 1]
-    assert search.reminded == [trial.note for trial in resumed.trials]
+    assert [trial.note.search["told"] for trial in resumed.trials if trial.note.search] == [0, 1]
+    assert search.reminded == [trial.note.search for trial in resumed.trials]
 
 
 def test_only_a_search_that_takes_a_prediction_is_given_one() -> None:

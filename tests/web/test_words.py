@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctxval.campaign.dynamics import PREDICTION
 from ctxval.core.trial import Origin, Trial
+from ctxval.core.trial_note import TrialNote
 from ctxval.learning import ExecutionPrediction
 from ctxval.web.page import in_words, why
 from facts import assert_names
@@ -25,7 +25,15 @@ JSON = st.recursive(
 
 
 def trial(origin: Origin = "acquisition", note: dict[str, Any] | None = None, because: str | None = None) -> Trial:
-    return Trial(3, origin, "open", np.zeros(1), {"goal": 0.25, "load": [1.0, 2.0]}, note=note, because=because)
+    return Trial(
+        3,
+        origin,
+        "open",
+        np.zeros(1),
+        {"goal": 0.25, "load": [1.0, 2.0]},
+        note=TrialNote.from_json(note or {}),
+        because=because,
+    )
 
 
 @pytest.mark.parametrize(
@@ -50,7 +58,7 @@ def trial(origin: Origin = "acquisition", note: dict[str, Any] | None = None, be
             ["A person chose this task.", "Since the last execution of this task: fuse replaced."],
         ),
         (
-            trial("manual", {PREDICTION: PREDICTED.to_json()}),
+            trial("manual", {"prediction": PREDICTED.to_json()}),
             ["A person chose this task.", "Predicted distance: 0.2 m; below 0.29 m with probability 0.95."],
         ),
     ],
@@ -59,10 +67,10 @@ def test_the_reason_of_a_choice(asked: Trial, sentences: list[str]) -> None:
     assert why(asked, "m") == sentences
 
 
-KEYS = st.sampled_from(["how", "why", "expected", "doubt", PREDICTION])
+KEYS = st.sampled_from(["how", "why", "expected", "doubt", "prediction"])
 
 
-@pytest.mark.parametrize("note", [{"expected": 10**400}, {PREDICTION: {**PREDICTED.to_json(), "deviation": 10**400}}])
+@pytest.mark.parametrize("note", [{"expected": 10**400}, {"prediction": {**PREDICTED.to_json(), "deviation": 10**400}}])
 def test_numbers_of_a_note_may_be_too_large(note: dict[str, Any]) -> None:
     assert why(trial("acquisition", note), "m")
 

@@ -24,13 +24,22 @@ def is_mjcf_text(mjcf: str | Path) -> bool:
     return isinstance(mjcf, str) and "<" in mjcf
 
 
-def compile_mjcf(mjcf: str | Path) -> tuple[str, Any]:
-    """Return the digest of a model's files, and the compiled ``mujoco.MjModel``."""
-    loader = require_extra("mujoco", "mujoco", "models of MuJoCo need").MjModel
+def compile_mjcf(mjcf: str | Path, *, simple: bool = True) -> tuple[str, Any]:
+    """Return the digest of a model's files, and the compiled ``mujoco.MjModel``.
+
+    MuJoCo takes bodies whose centre of mass is the origin of their joints as simple; these centres cannot move.
+    """
+    mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo need")
     with reworded(f"the MuJoCo model {str(mjcf)!r} cannot be read", InputError):
         digest, is_text = digest_of(mjcf), is_mjcf_text(mjcf)
     with reworded("MuJoCo cannot compile the model", ValueError):
-        return digest, loader.from_xml_string(str(mjcf)) if is_text else loader.from_xml_path(str(mjcf))
+        if simple:
+            loader = mujoco.MjModel
+            return digest, loader.from_xml_string(str(mjcf)) if is_text else loader.from_xml_path(str(mjcf))
+        spec = mujoco.MjSpec.from_string(str(mjcf)) if is_text else mujoco.MjSpec.from_file(str(mjcf))
+        for body in spec.bodies:
+            body.simple = 0
+        return digest, spec.compile()
 
 
 class Simulator:

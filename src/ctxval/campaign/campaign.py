@@ -26,7 +26,6 @@ from ctxval._util.progress import progress_shown, stage
 from ctxval._util.representation import call
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
-from ctxval.campaign.dynamics import SENSITIVITY
 from ctxval.campaign.envelope import EnvelopeSearch
 from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.executors import Executor, worker_pool
@@ -157,8 +156,7 @@ class Campaign:
     @property
     def sensitivity(self) -> Sensitivity | None:
         """How far small changes move closed loops of M if these are not smooth, as found before the first execution."""
-        notes = (trial.note or {} for trial in self.trials[:1])
-        return next((Sensitivity.from_json(note.get(SENSITIVITY)) for note in notes), None)
+        return next((Sensitivity.from_json(trial.note.sensitivity) for trial in self.trials[:1]), None)
 
     def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
         """Return the trajectories of the model and of the system in a trial; None if a trajectory is not stored.
@@ -260,6 +258,7 @@ class Campaign:
             ModelError, DesignError, DistanceError: if the task, the model or the distance cannot be used. All
                 executions are stored, and running again continues after the trial that failed.
             CampaignError: if there are no workers any more.
+            InputError: if an envelope, ``again`` or ``retry_failures`` lacks what it needs.
         """
         options = CertificateOptions.or_automatic(certificate, confidence, resolution, share)
         if explore is None:
@@ -326,6 +325,9 @@ class Campaign:
 
         The number of draws includes earlier ones. The other arguments and the errors raised are those of :meth:`run`;
         a CertificateError is raised if people are executing open trials.
+
+        Raises:
+            CertificateError: if people are executing open trials.
         """
 
         def missing() -> int:
@@ -373,6 +375,7 @@ class Campaign:
             StoreAccessError: if another process is running the store.
             ModelError, DesignError: if no controller can be designed and run on the model. The trial is stored as
                 failed and does not count as an execution.
+            InputError: if ``because`` has no reason or no parameters.
         """
         if because is not None and (parameters is None or not because.strip()):
             raise InputError('because needs the parameters of an earlier task and a reason, such as "fuse replaced".')
@@ -448,6 +451,7 @@ class Campaign:
         Raises:
             ExecutionError: if the trajectory is not a complete execution of the task; the trial stays open.
             DistanceError: if the distance function gives no usable number; the execution is stored.
+            InputError: if ``replace`` has no reason, or if the trial belongs to another campaign.
         """
         recorder, ended = self.recorder, replace is not None
         recorder.refresh()
@@ -669,6 +673,7 @@ class Campaign:
 
         Raises:
             CertificateError: if too little can be learned from the executions.
+            InputError: if ``false_alarms`` is not below 1.
         """
         if not false_alarms < 1:
             raise InputError(f"false_alarms must be less than 1, such as 0.001, got {false_alarms:g}.")

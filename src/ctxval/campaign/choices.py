@@ -13,7 +13,8 @@ from ctxval._util.representation import call
 from ctxval._util.texts import text_of
 from ctxval.core.plan import Plan, ended_early, least_distance, recorded_before_failure, recorded_until_end
 from ctxval.core.trajectory import COMPLETE, Trajectory
-from ctxval.core.trial import AT_LEAST, ENDED, FELL, Origin, State, Trial
+from ctxval.core.trial import Origin, State, Trial
+from ctxval.core.trial_note import NO_NOTE, LoopTimes, TrialNote
 from ctxval.core.validation import Validation
 from ctxval.errors import DistanceError, InputError
 
@@ -28,7 +29,7 @@ class Choice:
     #: the planned number of independent draws, which is stored with each draw; 0 if the results decide the number, None
     #: if it is not known
     planned_draws: int | None = None
-    note: dict[str, Any] | None = None  #: what is recorded about the choice, in types that JSON has
+    note: TrialNote = NO_NOTE  #: what is recorded about the choice
     #: the number of tasks that were tested and are not steady; None if this task is to be tested
     rejected: int | None = None
     #: the task parameters as a person gave them; None if they are those of the point, rounded
@@ -68,9 +69,9 @@ class Execution:
     at_least: float | None = None  #: what the distance of a failed execution is at least; None if nothing is known
     unusable: str | None = None  #: the reason why the distance function gave no usable number
     #: the seconds after which the closed loops of M and S ended by a fall or an instability, None for one that did not
-    ends: tuple[float | None, float] | None = None
+    ends: LoopTimes | None = None
     #: the seconds after which the robots of M and S fell, None for one that did not; None if neither is known to
-    falls: tuple[float | None, float | None] | None = None
+    falls: LoopTimes | None = None
     lost: str | None = None  #: the reason why the worker was lost, which is not a failure of the system
     seconds: float | None = None  #: the duration, if it is known
 
@@ -106,7 +107,7 @@ class Execution:
         run, of_model = self.trajectory, plan.model_trajectory
         known = self
         if isinstance(run, Trajectory) and not run.batch_shape and validation.fall is not None:
-            falls = validation.fall.seconds(of_model), validation.fall.seconds(run)
+            falls = LoopTimes(validation.fall.seconds(of_model), validation.fall.seconds(run))
             known = replace(self, falls=None if falls == (None, None) else falls)
         if isinstance(run, Trajectory) and ended_early(plan, run):
             tolerance = validation.start_tolerance if start_tolerance is None else start_tolerance
@@ -115,7 +116,7 @@ class Execution:
             end, end_of_model = (float(part.times[-1] - part.times[0]) for part in (run, of_model))
             ended = replace(known, trajectory=run if run.horizon else None)
             if alone or of_model.ended != COMPLETE:
-                ended = replace(ended, ends=(None if alone else end_of_model, end))
+                ended = replace(ended, ends=LoopTimes(None if alone else end_of_model, end))
             if alone:
                 return replace(ended, failed=run.ended)
             return ended._with_distance(lambda: validation.measure(plan, run))
@@ -130,16 +131,10 @@ class Execution:
     def ended(self, trial: Trial, *, executed: bool = True) -> Trial:
         """Return a trial in the final state that this measured execution gives it."""
         state: State = "failed" if self.failed is not None else "unmeasured" if self.distance is None else "completed"
-        note = {key: value for key, value in (trial.note or {}).items() if key not in (AT_LEAST, ENDED, FELL)}
-        if self.at_least is not None:
-            note[AT_LEAST] = self.at_least
-        if self.ends is not None:
-            note[ENDED] = dict(zip(("model", "system"), self.ends, strict=True))
-        if self.falls is not None:
-            note[FELL] = dict(zip(("model", "system"), self.falls, strict=True))
+        note = replace(trial.note, at_least=self.at_least, ends=self.ends, falls=self.falls)
         failure = self.unusable if self.failed is None else text_of(self.failed)
         ended = replace(trial, state=state, executed=executed, distance=self.distance, failure=failure)
-        return replace(ended, seconds=self.seconds, note=note or None)
+        return replace(ended, seconds=self.seconds, note=note)
 
     def is_that_of(self, trial: Trial) -> bool:
         """Return whether a trial of the same task has stored this execution already."""

@@ -18,7 +18,7 @@ from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.history import at_points, executed_trials
 from ctxval.campaign.storage.store import Store
-from ctxval.campaign.thinking import THINKING, CampaignThinking, TimeShortage
+from ctxval.campaign.thinking import CampaignThinking, TimeShortage
 from ctxval.certificates.checks import is_open
 from ctxval.certificates.dynamics import draws_for
 from ctxval.certificates.evidence import Evidence, Learned, SuiteRuns
@@ -31,6 +31,7 @@ from ctxval.core.target import Target
 from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.trial import REDEFINED, Trial, Trials
+from ctxval.core.trial_note import TrialNote
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
@@ -42,17 +43,14 @@ from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
 
-SENSITIVITY = "sensitivity"  #: key of a :class:`Sensitivity` in the note of the first trial
-PREDICTION = "prediction"  #: key of the prediction of an execution in the note of its trial
 NEAR = 0.02  #: a task that differs from an executed one by less than this in every coordinate is no new one
 
 _Known = Latest[tuple[object, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None, Ledger]]
 
 
-def prediction_in(note: Mapping[str, Any] | None) -> ExecutionPrediction | None:
+def prediction_in(note: TrialNote) -> ExecutionPrediction | None:
     """Return the prediction of an execution in the note of its trial, of whichever distance; None if there is none."""
-    stored = (note or {}).get(PREDICTION)
-    return ExecutionPrediction.from_json(stored) if isinstance(stored, dict) else None
+    return None if note.prediction is None else ExecutionPrediction.from_json(note.prediction)
 
 
 class SensitivityWarning(UserWarning):
@@ -137,11 +135,11 @@ class CampaignDynamics:
         seconds = ledger.seconds("loops", lambda costs: costs.plan(loops) + costs.run(1, loops))
         return ledger.costs is None or seconds <= ledger.costs.thinking.seconds
 
-    def note(self, trials: Sequence[Trial]) -> dict[str, Any]:
-        """Return what the next trial stores of the thinking on its task; empty without a budget."""
-        note = self.thinking.note(trials, self.ledger(trials) if trials else Ledger())
-        found = {} if trials or self.sensitivity is None else {SENSITIVITY: self.sensitivity.to_json()}
-        return found if note is None else {THINKING: note, **found}
+    def noted(self, trials: Sequence[Trial]) -> dict[str, Any]:
+        """Return fields of the note of the next trial: the thinking on its task, if it is limited, and sensitivity."""
+        sensitivity = None if trials or self.sensitivity is None else self.sensitivity.to_json()
+        thinking = self.thinking.noted(trials, self.ledger(trials) if trials else Ledger())
+        return {"thinking": thinking, "sensitivity": sensitivity}
 
     def find_sensitivity(self, threshold: float | None) -> None:
         """Warn if small changes of M change distances as far as matters to a threshold; the first trial stores it.
@@ -309,9 +307,8 @@ class CampaignDynamics:
         return Evidence.from_json(self._store.computed(self._key(trials, confidence)))
 
     def _key(self, trials: Sequence[Trial], confidence: float) -> str:
-        text = json.dumps(
-            [self._allowed(trials), *((trial.number, trial.state, trial.distance, trial.note) for trial in trials)]
-        )
+        of_trials = ((trial.number, trial.state, trial.distance, trial.note.to_json()) for trial in trials)
+        text = json.dumps([self._allowed(trials), *of_trials])
         physical = "".join(f"{name} " for name in self.study.given.physical)
         return f"evidence {confidence} {self.study.target} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
@@ -505,9 +502,8 @@ class CampaignDynamics:
 
     def stored_prediction(self, trial: Trial) -> ExecutionPrediction | None:
         """Return the prediction that was stored before an execution, if it is one of the present distance."""
-        note = (trial.note or {}).get(PREDICTION)
-        present = isinstance(note, dict) and note.get("experiment") == self.experiment
-        return prediction_in(trial.note) if present else None
+        stored = trial.note.prediction
+        return None if stored is None or stored.get("experiment") != self.experiment else prediction_in(trial.note)
 
 
 def _ends(states: Array, inputs: Array) -> Array:

@@ -17,7 +17,7 @@ from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import AHEAD, SerialPool, WorkerPool
 from ctxval.core.plan import start_offset
 from ctxval.core.trajectory import DIVERGED, TERMINATED, Trajectory
-from ctxval.core.trial import CONVERGED, Trial
+from ctxval.core.trial import Trial
 from ctxval.errors import CampaignError, CtxvalError, ExecutionError, InputError, StoreError
 
 
@@ -240,6 +240,6 @@ def _result(recorder: TrialRecorder, ended: Trial, executed: Trajectory | None) 
         offset = start_offset(validation, validation.space.point(ended.parameters), executed)
         if offset.size:
             parts.append(f"its start was off by {offset.text}")
-    if (ended.note or {}).get(CONVERGED) is False:
+    if ended.note.converged is False:
         parts.append("the design of its controller did not converge")
     return "   ".join(parts)

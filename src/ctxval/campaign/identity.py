@@ -15,7 +15,7 @@ from ctxval._util.texts import text_of
 from ctxval.campaign.storage.store import Store
 from ctxval.core.plan import least_distance
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import AT_LEAST, REDEFINED, TOLD_ALONE, Change, Trial, Trials
+from ctxval.core.trial import REDEFINED, TOLD_ALONE, Change, Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreError, StoreMismatchError
 from ctxval.searches import DEFAULT, REGISTRY, Search, by_name
@@ -212,7 +212,7 @@ def remeasure(store: Store, validation: Validation, description: dict[str, Any])
 
 def _measured(trial: Trial) -> dict[str, Any]:
     """Return the fields of a trial that a new measurement can change."""
-    of_failed = {AT_LEAST: trial.least} if trial.state == "failed" and trial.ended_alone is None else {}
+    of_failed = {"at_least": trial.least} if trial.state == "failed" and trial.ended_alone is None else {}
     return {"state": trial.state, "distance": trial.distance, "failure": trial.failure, **of_failed}
 
 
@@ -223,7 +223,7 @@ def _measured_again(store: Store, validation: Validation, trial: Trial) -> Trial
         return trial
     point = validation.space.point(trial.parameters)
     if trial.state == "failed":
-        return replace(trial, note={**(trial.note or {}), AT_LEAST: least_distance(validation, point, model, system)})
+        return replace(trial, note=replace(trial.note, at_least=least_distance(validation, point, model, system)))
     try:
         distance = validation.remeasure(point, model, system)
     except DistanceError as error:

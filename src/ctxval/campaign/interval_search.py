@@ -33,12 +33,13 @@ from ctxval.certificates.dynamics import Dynamics, certify_dynamics
 from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import DistanceBound
-from ctxval.certificates.prediction_tests import DRAWN, HYPERCUBE, MANY, TESTS, hypercube_in
+from ctxval.certificates.prediction_tests import DRAWN, MANY, TESTS
 from ctxval.certificates.predictions import missing_tests, mostly_fail
-from ctxval.certificates.task_share import PREDICTED_ABOVE, bet_on
+from ctxval.certificates.task_share import bet_on
 from ctxval.certificates.verdict import counterexample, require_possible
 from ctxval.core.target import Target
 from ctxval.core.trial import Trial, Trials
+from ctxval.core.trial_note import NO_NOTE, TrialNote
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.share_search import ShareSearch
@@ -160,11 +161,11 @@ class IntervalSearch:
         if (self.tests >= MANY or self._target.by_draws) and not row:
             return Choice.tested(self.recorder.draw(), "iid")
         if row:
-            begun = (hypercube_in(trial.note) for trial in reversed(trials))
-            (chosen, _), note = next(filter(None, begun), (0, 1.0)), None
+            begun = (trial.note.hypercube for trial in reversed(trials))
+            (chosen, _), note = next(filter(None, begun), (0, 1.0)), NO_NOTE
         else:
             chosen, share = self._hypercube(number)
-            note = {HYPERCUBE: [chosen, share]}
+            note = TrialNote(hypercube=(chosen, share))
         return replace(Choice.tested(self.recorder.draws.hypercube(number, chosen)[row], "spread"), note=note)
 
     def _hypercube(self, number: int) -> tuple[int, float]:
@@ -297,7 +298,7 @@ class IntervalSearch:
             return None
         # The first of the tasks, which are in no order.
         stake = bet_on(learned.search.share_above(learned.drawn_from, threshold), self._target.share)
-        note = {PREDICTED_ABOVE: [float(threshold), len(rows) / len(tasks), stake]}
+        note = TrialNote(predicted_above=(float(threshold), len(rows) / len(tasks), stake))
         return replace(Choice.tested(tasks[rows[0]]), note=note)
 
     def _by_evidence(self, evidence: Evidence) -> Choice:

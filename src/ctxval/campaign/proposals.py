@@ -23,13 +23,13 @@ from ctxval._util.progress import stage
 from ctxval._util.texts import enumerated, shortened
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.costs import costs_of
-from ctxval.campaign.dynamics import PREDICTION, CampaignDynamics
+from ctxval.campaign.dynamics import CampaignDynamics
 from ctxval.campaign.storage.store import Store
-from ctxval.campaign.thinking import THINKING
 from ctxval.certificates.prediction_tests import TESTS
 from ctxval.core.model import Step, run_of
 from ctxval.core.rollout import rollout
-from ctxval.core.trial import CONVERGED, UNSTEADY, Trial, Trials
+from ctxval.core.trial import Trial, Trials
+from ctxval.core.trial_note import RESERVED, TrialNote
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
 from ctxval.learning.closed_loops import LoopPlanner
@@ -118,7 +118,7 @@ class Proposals:
         self._validation, self._search, self._dynamics = validation, search, dynamics
         self.thinking: float | None = None  # seconds that a choice may take, if they are stated
 
-    def next(self, trials: Sequence[Trial], rejected: int = 0) -> tuple[Array, Note]:
+    def next(self, trials: Sequence[Trial], choice: Choice) -> tuple[Array, TrialNote]:
         """Return the search's next point ``(d,)``, tested and rounded unless an earlier trial has it, and its note."""
         search, steady = self._search, DesignContinuity(self._dynamics.study.planner)
         with stage("choosing a task", unit="designs") if search.uses_prediction else nullcontext():
@@ -132,12 +132,13 @@ class Proposals:
                     prediction = replace(prediction, costs=costs, steady=steady, candidates=left)
                     prediction = replace(prediction, thinking=self.thinking)
                 search.use_prediction(prediction)
-            point, note = self._asked()
+            point, attached = self._asked()
+            note = replace(choice.note, search=attached)
             repeats = self._validation.space.members is None
             if repeats and any(point.tobytes() == trial.unit_point.tobytes() for trial in trials):
                 return point, note
             untested = search.iid or self._dynamics.has_no_time(trials)
-            point, note = self._final(point, trials, None if untested else steady, note, rejected)
+            point, note = self._final(point, trials, None if untested else steady, note, choice.rejected or 0)
             if isinstance(search, SequentialSearch):
                 search.amend(point)
             return point, note
@@ -162,7 +163,7 @@ class Proposals:
         gaps = np.linalg.norm(tasks[:, None] - waiting, axis=2).min(axis=1)
         return np.asarray(tasks[gaps.argmax()])
 
-    def tested(self, choice: Choice, trials: Sequence[Trial]) -> tuple[Array, Note]:
+    def tested(self, choice: Choice, trials: Sequence[Trial]) -> tuple[Array, TrialNote]:
         """Return the point ``(d,)`` of a choice that another part has made, rounded and tested, and its note."""
         assert choice.unit_point is not None
         if choice.parameters is not None or choice.origin == "iid":
@@ -170,7 +171,7 @@ class Proposals:
         steady = DesignContinuity(self._dynamics.study.planner) if choice.rejected is None else None
         return self._final(choice.unit_point, trials, steady, choice.note, choice.rejected or 0)
 
-    def _asked(self) -> tuple[Array, Note]:
+    def _asked(self) -> tuple[Array, Note | None]:
         """Return the point ``(d,)`` that the search proposes, and its note, which is stored as JSON."""
         asked, dimension = self._search.ask(1), self._validation.space.dimension
         point: Array = np.empty(0)
@@ -180,17 +181,17 @@ class Proposals:
         if point.shape != (1, dimension) or not ((point >= 0) & (point <= 1)).all():
             got = shortened(repr(asked), 200)
             raise InputError(f"a search must return points of the unit cube, shape (1, {dimension}), got {got}.")
-        note, reserved = self._search.note(), (PREDICTION, CONVERGED, UNSTEADY, THINKING)
-        if isinstance(note, dict) and set(reserved) & set(note):
-            raise InputError(f"the note of a search must not have the keys {enumerated(reserved, 10)}.")
+        note = self._search.note()
+        if isinstance(note, dict) and set(RESERVED) & set(note):
+            raise InputError(f"the note of a search must not have the keys {enumerated(RESERVED, 20)}.")
         with suppress(TypeError, ValueError):
             if note is None or (isinstance(note, dict) and json.dumps(note, allow_nan=False)):
                 return np.asarray(point[0]), note
         raise InputError(f"the note of a search must be a dictionary of plain values for JSON, got {note!r}.")
 
     def _final(
-        self, point: Array, trials: Sequence[Trial], steady: DesignContinuity | None, note: Note, rejected: int
-    ) -> tuple[Array, Note]:
+        self, point: Array, trials: Sequence[Trial], steady: DesignContinuity | None, note: TrialNote, rejected: int
+    ) -> tuple[Array, TrialNote]:
         """Return a steady task (if tested), rounded or left of a suite; its note counts the rejected ones."""
         remaining = remaining_tasks(self._validation, trials)
         if steady is not None:
@@ -202,7 +203,7 @@ class Proposals:
             point = self._validation.space.rounded(point)
         else:
             point = np.asarray(remaining[np.linalg.norm(remaining - point, axis=1).argmin()])
-        return point, {**(note or {}), UNSTEADY: rejected} if rejected else note
+        return point, replace(note, unsteady=rejected) if rejected else note
 
 
 class IndependentDraws:

@@ -16,8 +16,6 @@ from ctxval.core.validation import Validation
 from ctxval.learning.stage_costs import Costs, Ledger, Sizes, Speed, Thinking, ThinkingSettings, reduced, speed_to_json
 from ctxval.learning.worst_case import WorstCaseSettings
 
-THINKING = "thinking"  #: key in the note of a trial: the speed of the machine, and what the choice of its task took
-
 
 @dataclass(frozen=True)
 class TimeShortage:
@@ -86,17 +84,16 @@ class CampaignThinking:
         speed = self._known(trials) if self._limited else None
         if speed is None:
             return None
-        notes = [(trial.note or {}).get(THINKING) for trial in trials if trial.state != "open"]
         timed = [trial.seconds for trial in trials if trial.executed and trial.seconds is not None]
         execution = np.inf if self._manual else statistics.median(timed) if timed else None
-        known = [note for note in notes if isinstance(note, dict)]
+        known = [trial.note.thinking for trial in trials if trial.state != "open" and trial.note.thinking is not None]
         thinking = Thinking.after(known, self._stated, execution, speed, self._settings)
         return replace(thinking, seconds=thinking.decisive) if self._decides else thinking
 
     def _known(self, trials: Sequence[Trial]) -> Speed | None:
         """Return the speed that a trial stores, or that was measured; None if it is not known."""
-        notes = ((trial.note or {}).get(THINKING) for trial in trials)
-        stored = (Speed.from_json(note.get("speed")) for note in notes if isinstance(note, dict))
+        noted = (trial.note.thinking for trial in trials if trial.note.thinking is not None)
+        stored = (Speed.from_json(each.get("speed")) for each in noted)
         return next((speed for speed in stored if speed is not None), self._speed)
 
     def measure(self, trials: Sequence[Trial]) -> None:
@@ -133,7 +130,7 @@ class CampaignThinking:
             ledger.replaced.append("learned dynamics, by the distances alone")
         return ledger
 
-    def note(self, trials: Sequence[Trial], ledger: Ledger) -> dict[str, Any] | None:
+    def noted(self, trials: Sequence[Trial], ledger: Ledger) -> dict[str, Any] | None:
         """Return what the next trial stores of the choice of its task; None without a budget."""
         speed = self._known(trials) if self._limited else None
         return None if speed is None else {"speed": speed_to_json(speed), **ledger.to_json()}

@@ -14,19 +14,18 @@ from ctxval._util.arrays import Array
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import text_of
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
-from ctxval.campaign.dynamics import PREDICTION, CampaignDynamics
+from ctxval.campaign.dynamics import CampaignDynamics
 from ctxval.campaign.goals_of_model import GoalsOfModel
 from ctxval.campaign.history import history_of
 from ctxval.campaign.identity import described_plainly, identify, remeasure, with_distance
 from ctxval.campaign.proposals import IndependentDraws, Proposals, remaining_tasks
 from ctxval.campaign.storage.disks import error_with_fallback
 from ctxval.campaign.storage.store import Store
-from ctxval.certificates import PLANNED
 from ctxval.core.controller import converged_of
 from ctxval.core.distance import Distance
 from ctxval.core.plan import Plan, require_repeatable, try_distance
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import CONVERGED, Origin, Trial, Trials
+from ctxval.core.trial import Origin, Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError, CtxvalError, DistanceError, InputError, StoreAccessError, StoreError
 from ctxval.models import Refined
@@ -113,7 +112,7 @@ class TrialRecorder:
         history = history_of(self._trials)
         if history:
             self._tell_search(history)
-            self.search.remember([trial.note for trial in history])
+            self.search.remember([trial.note.search for trial in history])
 
     def _tell_search(self, trials: Sequence[Trial]) -> None:
         known = Trials(trials)
@@ -194,7 +193,7 @@ class TrialRecorder:
                     self._parts_tried = True
                 with suppress(InputError):  # an attribute of a user's controller with this name that is something else
                     if (converged := converged_of(plan.controller)) is not None:
-                        trial = replace(trial, note={**(trial.note or {}), CONVERGED: bool(converged)})
+                        trial = replace(trial, note=replace(trial.note, converged=bool(converged)))
                 opened.append(OpenTrial(trial, plan))
                 self._trials.append(trial)
                 if attempts:
@@ -216,7 +215,7 @@ class TrialRecorder:
 
     def _next_trial(self, choice: Choice, attempts: int) -> Trial:
         """Return the trial of a choice, and tell the search that its point has no value yet."""
-        space, trials, note = self.validation.space, self._trials, None
+        space, trials = self.validation.space, self._trials
         if not self.has_tasks and choice.parameters is None:
             raise InputError("each task of the suite is executed, or is being executed; state one to execute it again.")
         if choice.unit_point is None:
@@ -233,20 +232,19 @@ class TrialRecorder:
             if not isinstance(self.search, SequentialSearch):
                 self.replay()  # such a search may still know the point that it proposed, and not the rounded one
                 trials = self._trials
-            unit_point, note = self._proposals.next(trials, choice.rejected or 0)
-            note = {**(note or {}), **choice.note} if choice.note else note
+            unit_point, note = self._proposals.next(trials, choice)
         else:
             origin = choice.origin
             unit_point, note = self._proposals.tested(choice, trials)
             self.search.tell(unit_point[None], [np.nan])
         if origin == "iid" and choice.planned_draws is not None:
-            note = {**(note or {}), PLANNED: choice.planned_draws}
+            note = replace(note, draws=choice.planned_draws)
         if self.predicts:
             self.dynamics.thinking.measure(trials)
         if self.predicts and (predicted := self.dynamics.predict(trials, unit_point)) is not None:
-            note = {**(note or {}), PREDICTION: {**predicted.to_json(), "experiment": self.dynamics.experiment}}
-        if self.predicts and (thought := self.dynamics.note(trials)):
-            note = {**(note or {}), **thought}
+            note = replace(note, prediction={**predicted.to_json(), "experiment": self.dynamics.experiment})
+        if self.predicts:
+            note = replace(note, **self.dynamics.noted(trials))
         key = unit_point.tobytes()
         same = (trial.parameters for trial in trials if trial.unit_point.tobytes() == key)
         parameters = choice.parameters or next(same, None) or space.describe_point(space.from_unit(unit_point))

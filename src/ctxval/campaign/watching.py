@@ -34,6 +34,7 @@ class Watch:
     Raises:
         CertificateError: if the campaign has too few executions with trajectories, or if nothing can be learned from
             them.
+        InputError: if the state belongs to another watch.
     """
 
     def __init__(
@@ -101,6 +102,7 @@ class Watch:
 
         Raises:
             ExecutionError: if the trajectory is not a complete execution of the task.
+            InputError: if the run has no trajectory, missing values, or states that cannot be estimated.
         """
         require("run", Trajectory | Execution, run)
         execution = Execution(run) if isinstance(run, Trajectory) else run

@@ -13,7 +13,7 @@ from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.posterior import Diagnosis, DistanceBound, diagnose, instantaneous_bound
 from ctxval.certificates.predictions import CheckedPrediction
 from ctxval.certificates.provenance import Neighbour, Provenance
-from ctxval.certificates.sample import PLANNED, RecoveredFailure, Sample, require_learned
+from ctxval.certificates.sample import RecoveredFailure, Sample, require_learned
 from ctxval.certificates.scenario import Audit, SamplingDiscarding, Scenario, samples_needed, tail, volume_bound
 from ctxval.certificates.stopping import StoppingDecision, StoppingRule
 from ctxval.certificates.verdict import Assessment, Verdict, assess, judge, judge_by
@@ -21,7 +21,6 @@ from ctxval.core.coverage import StateInputCoverage, StateInputGap, UnsampledCor
 
 __all__ = [
     "KINDS",
-    "PLANNED",
     "RESOLUTION",
     "AnytimeAudit",
     "Assessment",

@@ -40,7 +40,11 @@ class AnytimeAudit(CertificateKind):
 
     @checked
     def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
-        """Bound the volume above the threshold, which was fixed before the draws; failed draws violate it."""
+        """Bound the volume above the threshold, which was fixed before the draws; failed draws violate it.
+
+        Raises:
+            CertificateError: if there is no threshold, or no independent draw.
+        """
         if sample.threshold is None:
             what = "an anytime audit bounds the volume above a threshold"
             raise CertificateError(f"{what}, so it needs one (--threshold).")

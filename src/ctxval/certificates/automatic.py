@@ -53,7 +53,11 @@ class WholeSuite(CertificateKind):
     tests: NonNegativeInt = TESTS  #: executions of drawn tasks that a law of the distances needs
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return the certificate; the largest executed distance is the largest of all."""
+        """Return the certificate; the largest executed distance is the largest of all.
+
+        Raises:
+            CertificateError: if a task of the suite has no distance.
+        """
         members, missing = sample.members, sample.not_executed
         left = RemainingTasks(sample, self.tests)
         if missing and left.can_be_bounded:

@@ -212,7 +212,11 @@ KINDS = KindRegistry("certificate", "ctxval.certificates", method="certify")
 
 
 def require_use(kind: str, given: Iterable[str]) -> None:
-    """Refuse options that a kind would ignore: a user who gives one expects it to have an effect."""
+    """Refuse options that a kind would ignore: a user who gives one expects it to have an effect.
+
+    Raises:
+        CertificateError: if the option is for other kinds.
+    """
     options = KINDS.find(kind).options()
     for option in given:
         kinds = " or ".join(name for name in KINDS.built_in if option in KINDS.find(name).options())

@@ -48,7 +48,7 @@ def bets_against(
     It is in any case if it is said to be ``noisy``.
     """
     known = [trial for trial in trials if trial.distance is not None or trial.ended_alone is not None]
-    noises = [prediction.get("noise") for trial in trials if (prediction := _prediction(trial))]
+    noises = [trial.note.prediction.get("noise") for trial in trials if trial.note.prediction]
     if not any(noises) and not noisy:
         return None
     if not noisy and not noises[-1]:
@@ -69,13 +69,8 @@ def bets_against(
     return Bets(0.5 * (whole + repetitions), above, len(known), quantile)
 
 
-def _prediction(trial: Trial) -> dict[str, object]:
-    note = (trial.note or {}).get("prediction")
-    return note if isinstance(note, dict) else {}
-
-
 def _predicted_chance(trial: Trial, threshold: float) -> float:
-    stored = _prediction(trial)
+    stored = trial.note.prediction or {}
     try:
         if isinstance(noise := stored.get("noise"), dict):
             quantiles = [np.inf if each is None else float(each) for each in noise["distances"]]

@@ -68,6 +68,9 @@ class Dynamics(CertificateKind):
         """Return :func:`certify_dynamics` of the trials and of what is learned from their trajectories.
 
         If it does not keep the threshold, it forecasts the fewest executions that can decide.
+
+        Raises:
+            CertificateError: if no dynamics can be learned, or a trial has no distance.
         """
         threshold = sample.threshold
         learned = require_learned(sample, self.name)
@@ -113,7 +116,11 @@ def draws_for(confidence: float) -> int:
 
 
 def certify_dynamics(sample: Sample, evidence: Evidence) -> Certificate:
-    """Return the bound that d* stays below with the confidence of the evidence, which is of the same trials."""
+    """Return the bound that d* stays below with the confidence of the evidence, which is of the same trials.
+
+    Raises:
+        CertificateError: if some draws diverge, or an execution could not be predicted.
+    """
     confidence, upper, error = evidence.confidence, evidence.raised, evidence.error
     rank_within(confidence, len(evidence.maxima))
     if not np.isfinite(upper + error):

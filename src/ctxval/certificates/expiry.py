@@ -323,7 +323,11 @@ class WatchState(ShortRepr):
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
-        """Return the state that :meth:`to_json` returned; an InputError if these are not its values."""
+        """Return the state that :meth:`to_json` returned; an InputError if these are not its values.
+
+        Raises:
+            InputError: if it is not what ``to_json`` returned.
+        """
 
         def array(listed: Any) -> Array | None:
             return None if listed is None else np.array(listed, dtype=np.float64)

@@ -42,7 +42,11 @@ class CertificateOptions(ShortRepr):
     def or_automatic(
         cls, certificate: CertificateOptions | None, confidence: float, resolution: float, share: float = 1.0
     ) -> CertificateOptions:
-        """Return a certificate that is given, beside which no options may stand; else ``auto`` with the options."""
+        """Return a certificate that is given, beside which no options may stand; else ``auto`` with the options.
+
+        Raises:
+            InputError: if options stand beside a certificate.
+        """
         if certificate is None:
             return cls(Automatic(resolution, share=share), confidence)
         if (confidence, resolution, share) != (CONFIDENCE, RESOLUTION, 1.0):

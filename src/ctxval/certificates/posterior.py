@@ -49,7 +49,11 @@ class DistanceBound(CertificateKind):
 
     @checked
     def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
-        """Return the bound that d* stays below with the confidence."""
+        """Return the bound that d* stays below with the confidence.
+
+        Raises:
+            CertificateError: if a task is too far from all trials.
+        """
         threshold = sample.threshold
         far = (farthest := farthest_task(sample.points)) > self.resolution
         # Many trials that do not cover the tasks are refused before the draws, which take long.

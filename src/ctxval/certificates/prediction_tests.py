@@ -19,8 +19,7 @@ probability of 95 %.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -28,17 +27,7 @@ from ctxval.core.trial import Origin
 
 TESTS = 8  # default number, and number of points of a hypercube
 MANY = 22  # number of tests from which on they are independent draws
-HYPERCUBE = "hypercube"
-"""Key of the number of a hypercube, and of the share of hypercubes that are like it, in the note of its first test."""
 DRAWN: tuple[Origin, ...] = ("iid", "spread")  # origins of tests: independent draws, and points of hypercubes
-
-
-def hypercube_in(note: Mapping[str, Any] | None) -> tuple[int, float] | None:
-    """Return the number of the hypercube that begins with a trial, and the share of those like it; else None."""
-    match (note or {}).get(HYPERCUBE):
-        case [int(number), float(share)] if number >= 0 and 0 < share <= 1:
-            return number, share
-    return None
 
 
 def share_missed(spread: int, independent: int, dimension: int, confidence: float) -> float:

@@ -12,15 +12,11 @@ from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
 from ctxval.certificates.evidence import Learned
-from ctxval.certificates.prediction_tests import hypercube_in
 from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
 from ctxval.errors import CertificateError
 
 SAME = 1e-9
 """Points of the unit cube that differ by no more than this are the same task."""
-
-PLANNED = "draws"
-"""Key of the planned number of draws in the note of an independent draw."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +30,11 @@ class RecoveredFailure(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Sample(ShortRepr):
-    """Executed trials as a certificate sees them: points, distances, and why each task was chosen."""
+    """Executed trials as a certificate sees them: points, distances, and why each task was chosen.
+
+    Raises:
+        CertificateError: if trials are open, or if the lists differ in length.
+    """
 
     points: Array  #: tasks as points of the unit cube, shape ``(n, d)``
     distances: Array  #: their distances, shape ``(n,)``; NaN if the execution failed or could not be measured
@@ -76,6 +76,9 @@ class Sample(ShortRepr):
 
         A failure is left out if the same task was executed with success later, unless it is an independent draw. The
         order of trials that people chose or imported has no meaning, so they are sorted by their tasks.
+
+        Raises:
+            CertificateError: if there are no trials.
         """
         if not trials:
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
@@ -97,17 +100,17 @@ class Sample(ShortRepr):
         )
         for place, trial in zip(places, manual, strict=True):
             counted[place] = trial
-        planned = [(trial.note or {}).get(PLANNED) if trial.origin == "iid" else None for trial in counted]
+        planned = [trial.note.draws if trial.origin == "iid" else None for trial in counted]
         return cls(
             np.array([trial.unit_point for trial in counted]),
             np.array([np.nan if trial.distance is None else trial.distance for trial in counted]),
             [trial.origin for trial in counted],
             [trial.state for trial in counted],
             [trial.number for trial in counted],
-            [each if isinstance(each, int) else None for each in planned],
+            planned,
             tuple(made_good),
             learned,
-            selected=float(np.prod([chosen[1] for trial in trials if (chosen := hypercube_in(trial.note))])),
+            selected=float(np.prod([chosen[1] for trial in trials if (chosen := trial.note.hypercube)])),
         )
 
     def only(self, origin: Origin) -> Sample:
@@ -140,7 +143,11 @@ class Sample(ShortRepr):
 
     @property
     def members(self) -> Array:
-        """The tasks of the suite, points of the unit cube ``(N, d)``; a CertificateError is raised without one."""
+        """The tasks of the suite, points of the unit cube ``(N, d)``; a CertificateError is raised without one.
+
+        Raises:
+            CertificateError: if tasks fill a box.
+        """
         if self.suite is None:
             raise CertificateError("tasks fill a box here, so they cannot all be executed; this kind is for a suite.")
         return self.suite
@@ -210,7 +217,11 @@ class Sample(ShortRepr):
 
 
 def require_learned(sample: Sample, kind: str) -> Learned:
-    """Return the predictions that come with a sample, which this kind of certificate needs."""
+    """Return the predictions that come with a sample, which this kind of certificate needs.
+
+    Raises:
+        CertificateError: if the experiment is not loaded.
+    """
     if sample.learned is None:
         raise CertificateError(
             f"the {kind} certificate uses what the experiment's model predicts, but the experiment is not loaded: use "

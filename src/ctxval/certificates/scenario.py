@@ -51,6 +51,9 @@ class Scenario(CertificateKind):
         """Return a bound on the volume of the tasks whose distance exceeds the largest one left after discarding.
 
         A failed execution counts as a violation, larger than any distance, so it must be among the discarded ones.
+
+        Raises:
+            CertificateError: if the draws are not independent, or if their number was not fixed beforehand.
         """
         discarded = self._require_discard()
         foreign = [origin for origin in sample.origins if origin != "iid"]
@@ -95,7 +98,11 @@ class Scenario(CertificateKind):
         return self.certificate(sample, statement, h, confidence, assumptions, details, volume=volume)
 
     def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
-        """Require independent draws alone, the number to discard, and more trials than that."""
+        """Require independent draws alone, the number to discard, and more trials than that.
+
+        Raises:
+            CertificateError: if trials are no independent draws.
+        """
         discarded = self._require_discard()
         if any(origin != "iid" for origin in beside):
             raise CertificateError(
@@ -139,7 +146,11 @@ def volume_bound(n: int, discarded: int, beta: Probability) -> float:
 
 @checked
 def samples_needed(volume: Probability, beta: Probability, discarded: NonNegativeInt = 0) -> int:
-    """Return the least N with ``Pr(V > volume) <= beta``; for k = 0, ``log(beta) / log(1 - volume)`` rounded up."""
+    """Return the least N with ``Pr(V > volume) <= beta``; for k = 0, ``log(beta) / log(1 - volume)`` rounded up.
+
+    Raises:
+        CertificateError: if it is more than 2^40.
+    """
     low, high = discarded, discarded + 1
     while tail(high, discarded, volume) > beta:
         low, high = high, 2 * high
@@ -189,6 +200,9 @@ class Audit(CertificateKind):
 
         The largest distance of all trials is at least that of the draws, so the volume above it is not larger. Only
         :attr:`Sample.countable` draws count, and none may have failed.
+
+        Raises:
+            CertificateError: if a draw failed.
         """
         drawn = countable_draws(sample, "an audit")
         if drawn.failed:

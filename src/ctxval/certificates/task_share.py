@@ -15,9 +15,9 @@ statement that at most a share p exceeds tau is falsified there, at any time and
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
@@ -25,9 +25,6 @@ from ctxval._util.checked import Must
 from ctxval.core.trial import Trial
 
 Share = Annotated[float, Must("a share of the tasks from 0.5 to 1", lambda value: 0.5 <= value <= 1)]
-
-PREDICTED_ABOVE = "predicted_above"
-"""Key of K / N and of the bet in the note of a task that was drawn where distances above the threshold are expected."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +84,7 @@ def bets_on_share(trials: Sequence[Trial], threshold: float, share: float, confi
 
 def _bet_of(trial: Trial, threshold: float, share: float) -> tuple[float, float] | None:
     """Return the share of the wealth that is bet on a trial, and K / N; None if its task was not drawn for a bet."""
-    note: Mapping[str, Any] = trial.note or {}
-    match note.get(PREDICTED_ABOVE):
-        case [float(stated), float(part), float(stake)] if stated == threshold and 0 < part <= 1 and 0 <= stake < 1:
-            return stake, part
+    stated, part, stake = trial.note.predicted_above or (None, 0.0, 0.0)
+    if stated == threshold:
+        return stake, part
     return (BETS.drawn * (1 - share), 1.0) if trial.origin == "iid" else None

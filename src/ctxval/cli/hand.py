@@ -20,7 +20,7 @@ from ctxval.cli.base import Allowed, command, named_values, out, print_verdict, 
 from ctxval.cli.config.settings import ExperimentSettings
 from ctxval.cli.config.stored_settings import Limits, Opened, open_store, open_target, trusted_settings
 from ctxval.core.exchange import TASK_FORMAT
-from ctxval.core.trial import CONVERGED, Trial
+from ctxval.core.trial import Trial
 from ctxval.errors import InputError
 from ctxval.web.jobs import ServedCampaign
 
@@ -94,7 +94,7 @@ def ask(
         steps = "`pi = controllers.started(plan.controller, plan.task)` and `u = pi(t, x)` at each step"
         why = "the controller cannot be written to a file: this is possible only for affine feedback (LQR and iLQR)."
         out.say(f"{why} Run its loop in Python: {plan}, then {steps}.")
-    if (waiting.trial.note or {}).get(CONVERGED) is False:
+    if waiting.trial.note.converged is False:
         out.say("the design of the controller did not converge: nearly the same task may have another controller.")
     if others:
         trials = "trial is" if len(others) == 1 else "trials are"

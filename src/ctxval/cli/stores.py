@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ctxval import report as reports
-from ctxval._util.checked import PositiveFloat, require
+from ctxval._util.checked import PositiveFloat, TimeLimit, require
 from ctxval._util.files import write_text
 from ctxval.campaign.storage.other_stores import provenance_of_store
 from ctxval.campaign.storage.store import CAUSE, Store
@@ -220,10 +220,10 @@ def print_envelope(envelope: Envelope) -> None:
 def why(store: Path, allowed: Allowed, most: int = 2, thinking: float | None = None) -> Any:
     from ctxval.studies.causes import find_causes  # imported here: the other commands do not need it
 
-    loaded = open_store(store, allowed)
-    campaign = loaded.campaign
+    require("thinking", TimeLimit | None, thinking)
+    campaign = open_store(store, allowed).campaign
     digest = campaign.store.digest()
-    causes = find_causes(campaign, most=most, thinking=base.stated_seconds(thinking, loaded.settings.thinking))
+    causes = find_causes(campaign, most=most, thinking=thinking)
     with suppress(StoreError):  # a store that cannot be written has no report with it
         campaign.store.keep_computed(CAUSE, causes.sentence, digest)
     out.say((causes.sentence, "bold" if causes.named else ""), wrap=True)

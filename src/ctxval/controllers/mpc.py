@@ -83,7 +83,11 @@ class RecedingHorizon(ShortRepr):
         return first
 
     def plan(self, t: int, x: Array) -> tuple[Array, Array]:
-        """Return the predicted states ``(steps + 1, n)`` and the planned inputs ``(steps, m)``."""
+        """Return the predicted states ``(steps + 1, n)`` and the planned inputs ``(steps, m)``.
+
+        Raises:
+            DesignError: if no inputs keep the limits, or the prediction is not finite.
+        """
         settings, limits, bounds = self.settings, self.settings.limits, self.settings.state_limits
         rows = np.minimum(t + 1 + np.arange(settings.steps), self.task.horizon)
         start, reference, R = as_floats("the state", x), self.task.reference[rows], settings.cost.R

@@ -30,6 +30,9 @@ class OutputFeedback(ShortRepr):
         outputs: a function ``h(x) -> y`` of M's states, or the indices of the states that are outputs.
         process: standard deviations of what M misses in each state in one step, a number or ``(n,)``.
         measurement: standard deviations of the errors of the outputs, a number or ``(p,)``.
+
+    Raises:
+        InputError: if a standard deviation is not positive.
     """
 
     def __init__(

@@ -35,6 +35,10 @@ class PID(ShortRepr):
         bias: inputs that are added, such as those that hold the weight of an arm, a number or ``(m,)``.
         derivative_filter: time constant in seconds of the low-pass filter of the derivative; 0 is no filter.
         limits: limits of the inputs, rows ``[low, high]`` for each, or one number h for ``[-h, h]`` of all.
+
+    Raises:
+        InputError: if components are no different indices.
+        ShapeError: if gains or bias have other shapes.
     """
 
     batched = True
@@ -62,7 +66,11 @@ class PID(ShortRepr):
         self.limits = None if limits is None else Limits.of(limits, inputs)
 
     def design(self, task: Task, model: Model) -> PIDFeedback:
-        """Return the controller that follows the chosen states of the task's reference."""
+        """Return the controller that follows the chosen states of the task's reference.
+
+        Raises:
+            InputError: if a component is no state of the task.
+        """
         n = task.initial_state.shape[-1]
         if max(self.components) >= n:
             raise InputError(f"components must be indices of the task's {n} states, got {list(self.components)}.")

@@ -58,6 +58,10 @@ class Term(ShortRepr):
     ``constant``            the numbers ``values``
     ``states``              the states whose indices are ``values``
     ======================  =========================================================================
+
+    Raises:
+        InputError: if its values are missing.
+        ShapeError: if its point has not three coordinates.
     """
 
     term: TermName
@@ -94,6 +98,9 @@ class Action(ShortRepr):
     The ``target`` of a ``position`` is ``default + scale a``, and the inputs of the system are these positions. With
     ``torque``, the inputs are ``kp (default + scale a - q) - kd dq``, at each step of the task. With ``direct``, the
     inputs are ``scale a``.
+
+    Raises:
+        InputError: if torques have no gains.
     """
 
     target: Literal["position", "torque", "direct"] = "position"
@@ -115,6 +122,10 @@ class PolicyContract(ShortRepr):
     """What a trained policy observes, and what its actions mean.
 
     Joints are names in the MJCF, or their indices among its joints after the base, in the order of the policy.
+
+    Raises:
+        InputError: if terms, joints or the fall do not fit the base.
+        ShapeError: if the pose has no number for each joint.
     """
 
     network: str | Path  #: file of the network: ``.onnx``, ``.npz``, ``.pt`` (TorchScript) or ``.zip`` (SB3)
@@ -163,7 +174,11 @@ class PolicyContract(ShortRepr):
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> Self:
-        """Return a contract from a table with the fields of this class, with tables for the terms and the action."""
+        """Return a contract from a table with the fields of this class, with tables for the terms and the action.
+
+        Raises:
+            InputError: if a key is missing, or the observation is no list.
+        """
         require_known("entry of a policy's contract", table, [each.name for each in fields(cls)])
         given = dict(table)
         for name in ("network", "dt", "observation"):

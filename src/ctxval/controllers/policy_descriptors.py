@@ -33,6 +33,9 @@ def convert_policy(
         mjcf: the MJCF of the robot, which the first and the third need for the order of joints or the default pose.
         joints: names of the joints in the order of the policy, if the descriptor has no order. By default, those of
             ``env.yaml`` are in the order of Isaac Lab, one depth of the kinematic tree after the other.
+
+    Raises:
+        InputError: if the file is none of the known ones.
     """
     with reworded(f"{descriptor} cannot be read as a descriptor of a policy"):
         table = _read(Path(descriptor))

@@ -84,6 +84,10 @@ class RobotPolicy(ShortRepr):
         contract: the contract, or its TOML file.
         mjcf: the MJCF of the robot, as text or a file, in which joints and actuators are found by their names. Without
             it, states and inputs must have the base first and then the joints in the order of the contract.
+
+    Raises:
+        InputError: if joints are not known.
+        ShapeError: if the network does not fit the contract.
     """
 
     batched = True
@@ -110,7 +114,11 @@ class RobotPolicy(ShortRepr):
         self._require_width(None)
 
     def layout(self, states: int) -> JointLayout:
-        """Return where states of a number have the joints."""
+        """Return where states of a number have the joints.
+
+        Raises:
+            ShapeError: if the task has another number of states.
+        """
         if self._layout is not None:
             return self._layout
         count, base = len(self.contract.joints), self.contract.base
@@ -164,7 +172,11 @@ class PolicyController(ShortRepr):
     task: Task
 
     def start(self, task: Task) -> PolicyMemory:
-        """Return the memory before the first step; refuse a time step that does not fit the contract."""
+        """Return the memory before the first step; refuse a time step that does not fit the contract.
+
+        Raises:
+            InputError: if dt or latency are no multiple of the task's dt.
+        """
         contract, batch = self.policy.contract, task.batch_shape
         if not np.isclose(contract.dt, contract.decimation * task.dt, rtol=1e-6, atol=0):
             wanted = f"{contract.dt:g} s / {contract.decimation} = {contract.dt / contract.decimation:g} s"

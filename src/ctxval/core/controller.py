@@ -46,6 +46,9 @@ class ControllerRun(ShortRepr):
 
     Attributes:
         controller: the controller, of which this is one run.
+
+    Raises:
+        InputError: if steps are not called in order, or ``step`` returns no pair.
     """
 
     def __init__(self, controller: ControllerWithMemory, task: Task) -> None:
@@ -55,7 +58,11 @@ class ControllerRun(ShortRepr):
         self._next = 0
 
     def __call__(self, t: int, x: Array) -> Array:
-        """Return the inputs ``(..., m)`` in the states ``(..., n)`` at the next step t."""
+        """Return the inputs ``(..., m)`` in the states ``(..., n)`` at the next step t.
+
+        Raises:
+            InputError: if steps are not called in order, or ``step`` returns no pair.
+        """
         if t != self._next:
             raise InputError(
                 f"a run of a controller with memory must be called once for each step in order, got step {t} in the "
@@ -79,6 +86,9 @@ def started(controller: Controller, task: Task) -> Feedback:
 
     A controller without memory is that function. One with memory gets a :class:`ControllerRun`, which begins with the
     memory of the task; call it once for each step, in order.
+
+    Raises:
+        InputError: if the controller cannot be called.
     """
     if isinstance(controller, ControllerWithMemory):
         return ControllerRun(controller, task)
@@ -159,7 +169,12 @@ def converged_of(controller: object, batch_shape: tuple[int, ...] = ()) -> Mask 
 
 @dataclass(frozen=True, eq=False, init=False)
 class Limits(ShortRepr):
-    """Limits of the inputs, ``low <= u <= high``."""
+    """Limits of the inputs, ``low <= u <= high``.
+
+    Raises:
+        InputError: if a lower limit is not below the upper one.
+        ShapeError: if they are not equally many.
+    """
 
     #: low, high: the lower and upper limits: a number for all inputs, or one for each input, shape ``(m,)``; infinite
     #: if there is no limit
@@ -235,7 +250,11 @@ def fed_back(K: Array, deviations: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class AffineFeedback(ShortRepr):
-    """Time-varying affine feedback ``u = v_t + K_t (x - x_t)``, clipped to its limits if it has any."""
+    """Time-varying affine feedback ``u = v_t + K_t (x - x_t)``, clipped to its limits if it has any.
+
+    Raises:
+        InputError: if it is called for a step without an input.
+    """
 
     gains: Array  #: the gains K, shape ``(..., H, m, n)``, or ``(H, m, n)`` if all tasks of the batch share them
     inputs: Array  #: the inputs v, shape ``(..., H, m)``
@@ -245,7 +264,11 @@ class AffineFeedback(ShortRepr):
     converged: Mask | None = None
 
     def __call__(self, t: int, x: Array) -> Array:
-        """Return the input at step t, shape ``(..., m)``."""
+        """Return the input at step t, shape ``(..., m)``.
+
+        Raises:
+            InputError: if there is no input for the step.
+        """
         steps = self.inputs.shape[-2]
         if not 0 <= t < steps:
             raise InputError(f"the controller has inputs for the steps 0 to {steps - 1}, got step {t}.")

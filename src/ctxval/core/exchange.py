@@ -45,6 +45,10 @@ def write_controller(
     """Write the controller of one task, affine feedback as LQR and iLQR design it, as ``.json`` or ``.npz``.
 
     States and inputs are names and units of the components; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
+
+    Raises:
+        InputError: if the controller is no affine feedback.
+        ShapeError: if it is a batch.
     """
     if not isinstance(controller, AffineFeedback):
         if isinstance(controller, ControllerWithMemory):
@@ -71,7 +75,12 @@ def write_controller(
 
 
 def read_controller(path: str | Path) -> ControllerFile:
-    """Read a controller from a ``.json`` or ``.npz`` file."""
+    """Read a controller from a ``.json`` or ``.npz`` file.
+
+    Raises:
+        InputError: if the file is not valid.
+        ShapeError: if its arrays do not belong together.
+    """
     with _reading(Path(path), CONTROLLER_FORMAT) as content:
         gains, inputs, states = (as_finite(name, content[name]) for name in ("gains", "inputs", "states"))
         if gains.ndim != 3 or inputs.shape != gains.shape[:2] or states.shape != (len(gains), gains.shape[2]):

@@ -63,7 +63,11 @@ class FloatingBase(ShortRepr):
         return velocity + _cross(self.angular_velocity(x), np.asarray(at, dtype=np.float64)) if any(at) else velocity
 
     def first_velocity(self, x: Array) -> int:
-        """Return the index of the first velocity in states ``(..., n)``."""
+        """Return the index of the first velocity in states ``(..., n)``.
+
+        Raises:
+            ShapeError: if n does not fit the base.
+        """
         n = int(x.shape[-1])
         if self.velocity is not None:
             return self.velocity
@@ -98,7 +102,11 @@ def _cross(a: Array, b: Array) -> Array:
 @checked
 @dataclass(frozen=True)
 class Fall(ShortRepr):
-    """The condition of a fall: the base is too low or too much tilted."""
+    """The condition of a fall: the base is too low or too much tilted.
+
+    Raises:
+        InputError: if neither height nor tilt is given.
+    """
 
     height: float | None = None  #: the least height of the base, metres; None if it does not matter
     tilt: PositiveFloat | None = None  #: the largest angle between the vertical axes of base and world, radians

@@ -153,6 +153,9 @@ def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
     """Return the Jacobians A = df/dx and B = df/du of a model at (x, u), by its ``jacobian`` or by central differences.
 
     Shapes ``(..., n), (..., m) -> (..., n, n), (..., n, m)``; a constant Jacobian may have no batch axes.
+
+    Raises:
+        ModelError: if a Jacobian is not finite, or a step has another shape.
     """
     jacobian = getattr(model, "jacobian", None)
 

@@ -20,6 +20,9 @@ def rollout(model: Model | Step, controller: Controller, task: Task, *, partial:
 
     A loop that diverges continues with NaN and infinity; it does not stop the other loops of its batch. If it may be
     ``partial``, an exception of the user's parts after the first step ends the trajectory before it.
+
+    Raises:
+        ShapeError: if controller or step return another shape.
     """
     with np.errstate(all="ignore"):
         x = np.array(task.initial_state)

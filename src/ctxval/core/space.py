@@ -84,6 +84,9 @@ class TaskSpace:
     >>> space = TaskSpace(goal=(-3.14, 3.14, "rad"), offset=([0, 0], [1, 2]))
     >>> space.names
     ('goal', 'offset[0]', 'offset[1]')
+
+    Raises:
+        InputError: if there is no parameter, or if a name or bound is not valid.
     """
 
     members: Array | None = None
@@ -205,7 +208,12 @@ class TaskSpace:
         return Parameters(self, require_shape("points", as_floats("points", points), (self.dimension,)))
 
     def point(self, values: Mapping[str, Any]) -> Array:
-        """Return the point ``(d,)`` with these values by name."""
+        """Return the point ``(d,)`` with these values by name.
+
+        Raises:
+            InputError: if a value is missing or outside of the space.
+            ShapeError: if a value has another shape.
+        """
         point = np.full(self.dimension, np.nan)
         for name, value in values.items():
             columns, given = self.columns(name), as_finite(name, value)
@@ -281,6 +289,9 @@ class TaskSpace:
         bounds.
 
         >>> space = TaskSpace(goal=(-1, 1), load=(0, 5)).distributed(goal=Normal(0.0, 0.3))
+
+        Raises:
+            InputError: if no distribution is given.
         """
         if not by_name:
             raise InputError("distributed needs the distribution of at least one parameter, such as goal=Normal(0, 1).")
@@ -293,6 +304,9 @@ class TaskSpace:
 
         The sampler ``(rng, n)`` returns n independent tasks, rows ``(n, d)`` within the bounds and in the units of the
         space.
+
+        Raises:
+            InputError: if the sampler is no function ``(rng, n)``.
         """
         if not callable(sampler):
             raise InputError(f"sampler must be a function (rng, n) -> rows (n, d), got {sampler!r}.")

@@ -32,6 +32,10 @@ class Task:
         environment: what else a design, a distance or a specification reads, such as the place of an obstacle: names
             with lists of numbers, each given like ``initial_state`` and with a width of its own.
         command: what a policy is told to do, such as velocities: the entry ``command`` of the environment.
+
+    Raises:
+        InputError: if numbers are not finite, or if a goal and a reference, or two commands are given.
+        ShapeError: if the shapes do not belong together.
     """
 
     def __init__(
@@ -101,7 +105,11 @@ class Task:
 
     @property
     def command(self) -> Array:
-        """The command, shape ``(..., k)``."""
+        """The command, shape ``(..., k)``.
+
+        Raises:
+            InputError: if the task has none.
+        """
         if COMMAND not in self.environment:
             raise InputError("the task must have a command, as in Task(..., command=[0.5, 0.0, 0.2]).")
         return self.environment[COMMAND]
@@ -112,7 +120,11 @@ class Task:
         return np.asarray(np.arange(self.horizon + 1) * self.dt)
 
     def require_width(self, width: int, like: str = "its initial_state") -> None:
-        """Refuse a goal or a reference that has another number of components than what it is compared with."""
+        """Refuse a goal or a reference that has another number of components than what it is compared with.
+
+        Raises:
+            ShapeError: if the goal or reference has another number of components.
+        """
         got = self.reference.shape[-1]
         if self.has_goal and got != width:
             raise ShapeError(f"the goal or reference of a task must have {width} components, as {like}, got {got}.")

@@ -42,6 +42,9 @@ class Normal(ShortRepr):
 
     They are in the parameter's units, and hold before the task space truncates the distribution to the parameter's
     bounds. Values ``(...)`` of a number, or ``(..., k)`` of a vector, give probabilities of their shape.
+
+    Raises:
+        InputError: if a deviation is not positive, or a number not finite.
     """
 
     mean: ArrayLike

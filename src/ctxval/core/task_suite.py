@@ -44,6 +44,9 @@ class TaskSuite(TaskSpace):
     >>> suite = TaskSuite({"slow lift": {"speed": 0.2, "path": "lift"}, "fast turn": {"speed": 1.0, "path": "turn"}})
     >>> suite.task_names
     ('slow lift', 'fast turn')
+
+    Raises:
+        InputError: if two tasks have the same parameters.
     """
 
     def __init__(

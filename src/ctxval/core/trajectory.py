@@ -41,6 +41,9 @@ class Transitions(ShortRepr):
 
     The length of a step, dt in seconds, is None if it is not known. The states and inputs may have names with units;
     these are empty if they are not known.
+
+    Raises:
+        ShapeError: if the arrays do not have as many rows and states.
     """
 
     x: Array
@@ -67,7 +70,12 @@ class Transitions(ShortRepr):
 
     @staticmethod
     def joined(parts: Sequence[Transitions]) -> Transitions:
-        """Return several sets of transitions as one set."""
+        """Return several sets of transitions as one set.
+
+        Raises:
+            InputError: if steps have different lengths.
+            ShapeError: if numbers of states or inputs differ.
+        """
         sizes = sorted({(part.x.shape[1], part.u.shape[1]) for part in parts})
         if len(sizes) > 1:
             different = " and ".join(f"{n} states and {m} inputs" for n, m in sizes)
@@ -90,7 +98,11 @@ class Transitions(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """The times, states and inputs of a closed loop, for one task or a batch of tasks."""
+    """The times, states and inputs of a closed loop, for one task or a batch of tasks.
+
+    Raises:
+        ShapeError: if times, states and inputs do not belong together.
+    """
 
     times: Array  #: seconds, shape ``(H + 1,)``
     states: Array  #: shape ``(..., H + 1, n)``
@@ -208,6 +220,10 @@ class Trajectory:
         """Read a trajectory from NPZ bytes or an NPZ file of at most so many bytes; no code in it is ever run.
 
         The states of a complete trajectory must have the shape ``(H + 1, n)``, if it is given.
+
+        Raises:
+            InputError: if the file cannot be read as a trajectory.
+            ShapeError: if the states have another shape.
         """
         name = "these bytes" if isinstance(source, bytes) else str(source)
         try:
@@ -230,6 +246,9 @@ class Trajectory:
         """Write one trajectory as CSV; the last row has no inputs.
 
         The columns are ``t`` and the named states and inputs, ``x0, x1, ...`` and ``u0, u1, ...`` by default.
+
+        Raises:
+            ShapeError: if it is a batch, or if there is not a name for each column.
         """
         if self.batch_shape:
             raise ShapeError(f"a CSV file must hold one trajectory, got a batch of shape {self.batch_shape}.")
@@ -264,6 +283,9 @@ class Trajectory:
             states, inputs: names of the columns, with or without units. If the file has none of the names, the
                 numbered columns ``x0, x1, ...`` and ``u0, u1, ...`` are read.
             most_rows: largest number of rows below the header; a file with more rows is refused.
+
+        Raises:
+            InputError: if columns are missing, there are fewer than two rows, or several recordings.
         """
         table = CsvTable(path)
         time = time_column(str(path), table.names)
@@ -290,6 +312,9 @@ class Trajectory:
         States are interpolated linearly, unit quaternions on the sphere. Inputs, which hold until the next sample, are
         averaged over the steps.
         A record that is there twice counts once.
+
+        Raises:
+            InputError: if times do not increase, steps are too long, or the end is missing.
         """
         if self.batch_shape:
             raise InputError("only a single trajectory can be resampled.")

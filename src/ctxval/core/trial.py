@@ -11,6 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array, read_only
 from ctxval._util.representation import ShortRepr, call, counted
 from ctxval.core.space import Point
+from ctxval.core.trial_note import NO_NOTE, TrialNote
 
 Origin = Literal["iid", "spread", "initial", "acquisition", "covering", "manual"]
 """The reason why a trial was chosen. Only iid trials, which are independent draws, enter a scenario bound."""
@@ -21,23 +22,6 @@ State = Literal["open", "completed", "failed", "unmeasured"]
 
 REDEFINED = "the distance has changed"
 """The reason in the history of a store whose distances were measured again by another definition."""
-
-CONVERGED = "converged"
-"""Key in the note of a trial: whether the design of its controller converged, if the controller tells."""
-
-UNSTEADY = "unsteady"
-"""Key in the note of a trial: the number of tasks that were not executed because their controllers jump."""
-
-AT_LEAST = "at_least"  #: key in the note of a failed trial: the distance that the steps before the failure have already
-
-ENDED = "ends"
-"""Key in the note of a trial whose closed loops ended early, by a fall or an instability: when those of M and S did.
-
-The times are in seconds, null for a loop that did not end. If S alone did, M was wrong by more than any distance.
-"""
-
-FELL = "falls"
-"""Key in the note of a trial in which a robot fell: the seconds after which that of M and that of S did, or null."""
 
 TOLD_ALONE = "its distance was told without a trajectory, and the distance has changed since: execute the task again."
 """The failure of a trial that was reported without a trajectory, so that a new distance cannot be computed."""
@@ -57,8 +41,7 @@ class Trial:
     distance: float | None = None  #: d(p); None if the trial is not completed
     failure: str | None = None  #: the reason why the trial failed or its distance could not be measured
     seconds: float | None = None  #: duration of the execution, if known
-    #: values for JSON that the search attached when it chose p; it gets them back when a campaign resumes
-    note: dict[str, Any] | None = None
+    note: TrialNote = NO_NOTE  #: what is recorded beside the task and the result
     #: what was changed on the system since an earlier trial of the same task that had another result
     because: str | None = None
 
@@ -78,15 +61,12 @@ class Trial:
         """
         if self.ended_alone is not None:
             return np.inf
-        known = (self.note or {}).get(AT_LEAST) if self.distance is None else self.distance
-        return float(known) if isinstance(known, int | float) else 0.0
+        return (self.note.at_least or 0.0) if self.distance is None else self.distance
 
     @property
     def ended_alone(self) -> float | None:
         """The seconds after which S fell or became unstable, if M did not; else None."""
-        ended = (self.note or {}).get(ENDED)
-        seconds = ended.get("system") if isinstance(ended, dict) else None  # the note of a store
-        return float(seconds) if self.state == "failed" and isinstance(seconds, int | float) else None
+        return self.note.ends.system if self.state == "failed" and self.note.ends is not None else None
 
     def __repr__(self) -> str:
         ended = {"distance": self.distance, "seconds": self.seconds, "attempts": self.attempts}
@@ -151,21 +131,20 @@ class Trials(tuple[Trial, ...]):
 def designs_sentence(trials: Sequence[Trial]) -> str | None:
     """Return which controllers of executed tasks did not converge or jump; None if nothing of the kind is recorded."""
     executed = [trial for trial in trials if trial.executed]
-    designs = [trial.note[CONVERGED] for trial in executed if trial.note is not None and CONVERGED in trial.note]
+    designs = [trial.note.converged for trial in executed if trial.note.converged is not None]
     worst = max(executed, key=lambda trial: -1.0 if trial.distance is None else trial.distance, default=None)
-    among = worst is not None and (worst.note or {}).get(CONVERGED) is False
+    among = worst is not None and worst.note.converged is False
     parts = []
     if failed := designs.count(False):
         where = f"{failed} of {len(designs)} executed tasks{', among them the worst one' if among else ''}"
         parts.append(f"the design of the controller did not converge at {where}")
-    if early := sum(ENDED in (trial.note or {}) for trial in executed if trial.distance is not None):
+    if early := sum(trial.note.ends is not None for trial in executed if trial.distance is not None):
         what = f"{early} of {len(executed)} executions ended early on M and S, by a fall or an instability"
         parts.append(f"{what}, and distances are over the common part")
-    falls = [(trial.note or {})[FELL] for trial in executed if FELL in (trial.note or {})]
-    if falls:
-        of_model, of_system = (sum(fall.get(whose) is not None for fall in falls) for whose in ("model", "system"))
+    if falls := [trial.note.falls for trial in executed if trial.note.falls is not None]:
+        of_model, of_system = (sum(seconds is not None for seconds in loop) for loop in zip(*falls, strict=True))
         parts.append(f"the robot fell in {of_system} of {len(executed)} executions, and on M in {of_model}")
-    rejected = sum(count for trial in trials if isinstance(count := (trial.note or {}).get(UNSTEADY), int))
+    rejected = sum(trial.note.unsteady or 0 for trial in trials)
     if rejected:
         tasks = f"{counted(rejected, 'task')} {'was' if rejected == 1 else 'were'} not executed"
         parts.append(f"{tasks}, because the controller jumps if the task changes by 1e-9 of its range")

@@ -43,6 +43,9 @@ def grid_truth(validation: Validation, per_axis: AxisPoints = 2001, refinements:
 
     S is executed ``per_axis ** d`` times, and ``72 ** d`` times at most in a refinement of d parameters. A CostWarning
     says so if these are more than ten million executions.
+
+    Raises:
+        InputError: if every execution fails.
     """
     space = validation.space
     cell = (space.high - space.low) / (per_axis - 1)
@@ -89,6 +92,9 @@ def search_truth(
         population: number of points in a generation, for each dimension.
         generations: largest number of generations in one repeat.
         climbs: climbs from random starts in one repeat; each starts at the best of sixteen random points.
+
+    Raises:
+        InputError: if every execution fails.
     """
     space, d, evaluations = validation.space, validation.space.dimension, 0
 

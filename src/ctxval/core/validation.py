@@ -134,7 +134,11 @@ class Validation:
         return self.outputs(x)
 
     def require_states(self, what: str) -> None:
-        """Refuse outputs in the place of states for what needs recorded states of M."""
+        """Refuse outputs in the place of states for what needs recorded states of M.
+
+        Raises:
+            InputError: if outputs are recorded.
+        """
         if self.outputs.hide_states:
             raise InputError(f"{what} needs recorded states of M, and this validation records outputs h(x) of them.")
 
@@ -163,7 +167,12 @@ class Validation:
     # The heart of the loop, for one task: plan, execute, accept
 
     def plan(self, point: ArrayLike) -> Plan:
-        """Design the controller for the task at ``(d,)`` and run it on the model; S is not executed."""
+        """Design the controller for the task at ``(d,)`` and run it on the model; S is not executed.
+
+        Raises:
+            ModelError: if the model does not predict the task.
+            ShapeError: if the task is a batch.
+        """
         parameters = self.space.parameters(point)
         try:
             plan = self.plan_of(parameters, self.task_at(parameters))
@@ -181,7 +190,11 @@ class Validation:
         return replace(plan, model_trajectory=run.frozen())
 
     def execute(self, plan: Plan) -> Trajectory:
-        """Execute S once."""
+        """Execute S once.
+
+        Raises:
+            ExecutionError: if the system fails.
+        """
         try:
             trajectory = self.system.execute(plan.controller, plan.task)
         except BaseException as error:
@@ -199,6 +212,9 @@ class Validation:
         If the closed loops of both M and S ended early, by a fall or an instability, or that of S at a fall that the
         synthesizer knows, it is the steps before. If only one of them did otherwise, there is no distance. An
         InputError says that it belongs to another task. A start tolerance replaces that of this validation.
+
+        Raises:
+            ExecutionError: if the result is no trajectory of the task.
         """
         tolerance = self.start_tolerance if start_tolerance is None else start_tolerance
         if not isinstance(trajectory, Trajectory):
@@ -359,7 +375,11 @@ class Validation:
         return Plan(parameters, task, controller, trajectory)
 
     def task_at(self, parameters: Parameters) -> Task:
-        """Return the task that the task function makes, or a batch of them, after a check of what it returns."""
+        """Return the task that the task function makes, or a batch of them, after a check of what it returns.
+
+        Raises:
+            InputError: if the task function returns no task.
+        """
         with _failing_as(InputError, "the task function"):
             task = self.task(parameters)
         if not isinstance(task, Task):

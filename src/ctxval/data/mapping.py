@@ -26,7 +26,11 @@ _VALID = re.compile(r"\s*(\S.*?)\s*(==|!=)\s*([+-]?\d+(?:\.\d*)?)\s*")
 @checked
 @dataclass(frozen=True)
 class Field:
-    """Where one state or input is in a log; the value is ``factor * recorded + offset``."""
+    """Where one state or input is in a log; the value is ``factor * recorded + offset``.
+
+    Raises:
+        InputError: if path, derivative or window are not valid.
+    """
 
     #: the name of a column, such as ``angle`` or ``observation.state[2]``, or a field of a message, such as
     #: ``/joint_states.position[0]``. A vector stands for all its components.
@@ -59,7 +63,11 @@ class Field:
         self.scale("")
 
     def scale(self, stated: str) -> float:
-        """Return the factor of the recorded value; ``stated`` is the unit that the log itself states, if any."""
+        """Return the factor of the recorded value; ``stated`` is the unit that the log itself states, if any.
+
+        Raises:
+            InputError: if the recorded unit is another one.
+        """
         if self.factor is not None:
             return float(self.factor)
         with reworded(f"the field {self.path}", InputError):
@@ -71,7 +79,11 @@ class Field:
 
 @dataclass(frozen=True)
 class Observer(ShortRepr):
-    """A function of the user's own that estimates states from the records of one recording."""
+    """A function of the user's own that estimates states from the records of one recording.
+
+    Raises:
+        InputError: if it is no function ``(y, u, dt) -> x``.
+    """
 
     #: ``(y, u, dt) -> x``, from the recorded states ``(H + 1, p)``, the inputs ``(H, m)`` and the time step in seconds
     #: to states ``(H + 1, n)``. The first states may be NaN, while it settles; they are left out. None until it is
@@ -90,7 +102,11 @@ class Observer(ShortRepr):
 
 @dataclass(frozen=True)
 class LogMapping(ShortRepr):
-    """How recordings become states and inputs at equal steps."""
+    """How recordings become states and inputs at equal steps.
+
+    Raises:
+        InputError: if there is no state, or if a name or ``valid`` is not valid.
+    """
 
     states: Mapping[str, Field]  #: the fields of the states and inputs by name, in the order of the model
     inputs: Mapping[str, Field] = field(default_factory=dict)
@@ -165,6 +181,9 @@ class LogMapping(ShortRepr):
 
         ``states`` and ``inputs`` are tables of fields by name; a field is a path, or a table with the attributes of
         :class:`Field`. An observer is a table with ``function = { ref = "module:attr" }`` and its ``states``.
+
+        Raises:
+            InputError: if states are missing, or a table has another form.
         """
         require_known("entry of the mapping of recordings", table, [field.name for field in fields(LogMapping)])
         if "states" not in table:
@@ -196,6 +215,9 @@ class LogMapping(ShortRepr):
         The states are ``states``, ``x`` or ``observation.state``, or the columns ``x0``, ``x1``, ...; the inputs are
         ``inputs``, ``u``, ``action`` or ``actions``, or the columns ``u0``, ``u1``, ... The names in ``states`` and
         ``inputs``, with their units, are looked for before these.
+
+        Raises:
+            InputError: if no field has a usual name.
         """
         columns, states, inputs = log.fields(), states or {}, inputs or {}
         wanted = {name: Field(name, unit) for name, unit in {**states, **inputs}.items()}

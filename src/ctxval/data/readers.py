@@ -195,6 +195,9 @@ def read_logs(paths: Sequence[str | Path]) -> list[Log]:
 
     A folder is a bag of ROS 2 if it has a file ``metadata.yaml``, a LeRobot data set if it has ``meta/info.json``, and
     otherwise all logs in it are read, in the order of their names. Files with the topics of one recording are one log.
+
+    Raises:
+        InputError: if there is no log.
     """
     logs = [log for path in paths for log in _logs(Path(path))]
     if not logs:

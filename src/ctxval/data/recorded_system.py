@@ -59,6 +59,9 @@ class Recorded:
             the records.
         stopped_by: what ended recordings that are shorter than their task, such as "a safety limit". They are then
             outcomes, as a fall is. If it is empty, they are failed executions.
+
+    Raises:
+        InputError: if there is no recording, or if one has gaps.
     """
 
     def __init__(
@@ -114,7 +117,11 @@ class Recorded:
         return runs[min(repetition, len(runs) - 1)]
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Return the recording of a task that is next in turn; raise an ExecutionError if there is none."""
+        """Return the recording of a task that is next in turn; raise an ExecutionError if there is none.
+
+        Raises:
+            ExecutionError: if the recording is shorter than the task.
+        """
         run, steps = self._run(task.name, task.repetition), task.horizon
         ended = run.ended if run.horizon <= steps else COMPLETE
         if run.horizon < steps and self.stopped_by:

@@ -81,7 +81,11 @@ def read_recordings(
 def recordings_of(
     logs: Sequence[Log], mapping: LogMapping | None = None, names: Mapping[str, list[str]] | None = None
 ) -> Recordings:
-    """Return the recordings in logs; ``names`` are those of the components of vector fields, if they are known."""
+    """Return the recordings in logs; ``names`` are those of the components of vector fields, if they are known.
+
+    Raises:
+        InputError: if nothing is recorded in steps of dt, or logs differ in states.
+    """
     chosen = LogMapping.usual(logs[0]) if mapping is None else mapping
     runs, breaks, notes, first = list[Recording](), list[Break](), list[str](), list[Channel]()
     dt = chosen.dt

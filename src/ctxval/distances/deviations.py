@@ -26,6 +26,9 @@ class StateNorm(NamedStates):
 
     Each difference is multiplied by its weight, divided by its scale, and then enters the norm. With a scale in the
     unit of its state, such as 0.1 m and 0.05 rad, differences of one scale count the same.
+
+    Raises:
+        InputError: if components are empty.
     """
 
     norm: Norm = 1  #: order of the norm: 1, 2 or infinity
@@ -56,7 +59,11 @@ class StateNorm(NamedStates):
         return None if (factors == 1).all() else factors
 
     def difference(self, states: Array, others: Array) -> Array:
-        """Return the weighted differences of the compared ones of states ``(..., n)``; leading axes broadcast."""
+        """Return the weighted differences of the compared ones of states ``(..., n)``; leading axes broadcast.
+
+        Raises:
+            ShapeError: if there is not a weight or scale for each state.
+        """
         gap = selected(self.gap(states, others), self.components)
         counts = [len(given) for given in (self.weights, self.scales) if given is not None]
         if set(counts) - {gap.shape[-1]}:

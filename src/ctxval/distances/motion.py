@@ -60,6 +60,9 @@ class CommandError(BodyVelocity):
 
     It is the combined measure of Remark 1 for policies that follow a command; M alone is measured for Aspect 1.
     :class:`BodyVelocity` has the attributes.
+
+    Raises:
+        ShapeError: if the command of a task has not three numbers.
     """
 
     to_task: ClassVar[bool] = True

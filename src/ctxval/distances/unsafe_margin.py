@@ -33,6 +33,9 @@ class UnsafeMargin(ShortRepr):
       larger than the largest deviation of the states that the specification looks at.
     - with a margin c, ``max(0, min(rho_M, c - rho_S))``. It exceeds c if and only if ``rho_M > c`` and ``rho_S < 0``:
       with the threshold c, a campaign asks whether every task with ``rho_M > c`` is safe.
+
+    Raises:
+        InputError: if there is no specification, or if the penalty is below 1.
     """
 
     to_task: ClassVar[bool] = True  #: whether it measures trajectories against the task

@@ -40,6 +40,9 @@ class Matern(Covariance):
     """Matern kernel of smoothness 3/2, 5/2 or 9/2, and a linear one ``v_0 + v_1 (x - c)'(z - c)`` if it has bounds.
 
     theta = log of (variance, length-scales), then of v_0 and v_1; c is the middle of the unit cube.
+
+    Raises:
+        InputError: if nu is none of these.
     """
 
     nu: float = 1.5  # the paper's

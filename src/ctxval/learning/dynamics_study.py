@@ -232,13 +232,19 @@ class DynamicsStudy(ShortRepr):
         count = scheduled(len(loops))
         key = digest(loops[:count])
         posterior, seed = None, (self.seed, count, 0)
+
+        def affords(steps: int) -> bool:
+            return ledger.optional("learning", "parameters of M from all of their prior", lambda c: c.steps(steps))
+
         if key not in self._effects_of:
             candidates = self.input_candidates(loops, together=True) + further_attributes(model, loops)
-            posterior = learned_parameters(model, loops[:count], on_model, seed, candidates, None, settings.parametric)
+            posterior = learned_parameters(
+                model, loops[:count], on_model, seed, candidates, None, settings.parametric, affords
+            )
             self._effects_of[key] = () if posterior is None else posterior.effects
         if posterior is None or count < len(loops):
             seed, known = (self.seed, len(loops), 0), self._effects_of[key]
-            posterior = learned_parameters(model, loops, on_model, seed, (), known, settings.parametric)
+            posterior = learned_parameters(model, loops, on_model, seed, (), known, settings.parametric, affords)
         if posterior is None:
             return None
         points = np.array([point for point, _ in executed])

@@ -12,8 +12,9 @@ mode is found by Gauss-Newton steps, and draws come from population Monte Carlo 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -47,8 +48,13 @@ class ParameterSettings:
     jitter: float = 0.2  # of draws around samples, in standard deviations
     effects: int = 2  # of inputs, such as a delay, at most
     explained: float = 0.05  # error of segments that is left, as a share of M's, below which no effects are looked for
-    starts: int = 3  # draws of the prior from which single steps are fitted if the parameters explain too little
     screened: int = 2  # Gauss-Newton steps with each of the effects that are tried
+    best: int = 16  # samples around which the next round of the cross-entropy method draws
+    wider_rounds: tuple[float, float] = (1.3, 0.05)  # factors of their covariance, and of the one of the round before
+    first_rounds: int = 2  # with each effect
+    further_rounds: int = 4  # with the best ones
+    starts: int = 3  # of these
+    last_rounds: int = 8  # with the best one
     price: float = 10.0  # by which an effect must raise the log posterior, beside the price of its size
 
 
@@ -208,6 +214,11 @@ class ParameterMode(ShortRepr):
         return self.height_at(self.z, self.here)
 
     @property
+    def explains(self) -> bool:
+        """Whether it leaves so little of M's errors that nothing else is looked for."""
+        return self.left <= self.settings.explained**2
+
+    @property
     def left(self) -> float:
         """The mean square of the errors of segments in shares of M's, outliers limited."""
         of_model = np.minimum(self.segments.missed, 10.0).mean()
@@ -236,63 +247,117 @@ class ParameterMode(ShortRepr):
         return ParameterPosterior(self.model, mean, covariance, samples, weights, at_mean.left, settings)
 
 
-def most_probable_parameters(
-    model: UncertainModel, executed: Sequence[Trajectory], rng: np.random.Generator, settings: ParameterSettings
-) -> ParameterMode | None:
-    """Return the mode of segments of the usual length or of single steps, which explains more; None without segments.
+class CrossEntropySearch:
+    """Looks for the mode of a model from all of its prior by the cross-entropy method (Rubinstein 1999).
 
-    Contacts begin and end with the parameters, so a fit of several steps, or one from the prior's mean alone, may end
-    in one of many local modes.
+    Contacts begin and end with the parameters, so Gauss-Newton steps may end in one of many local modes.
     """
-    segments = Segments.of(model, executed, rng, settings)
-    if segments is None:
-        return None
-    mode = ParameterMode.of(model, segments, settings)
-    short = Segments.of(model, executed, rng, replace(settings, steps=1))
-    if mode.left <= settings.explained**2 or short is None:
+
+    def __init__(self, model: UncertainModel, segments: Segments, settings: ParameterSettings) -> None:
+        self.origin = ParameterMode.of(model, segments, settings, steps=0)
+        K = len(self.origin.z)
+        self._mean, self._covariance = np.zeros(K), np.eye(K)
+        self.z, self.height = self.origin.z, self.origin.height
+
+    def advance(self, rounds: int, rng: np.random.Generator) -> Self:
+        """Sample some rounds, each around the best samples of the one before."""
+        settings, K = self.origin.settings, len(self.z)
+        best = settings.best
+        weights = np.log(best + 0.5) - np.log(np.arange(1, best + 1))
+        weights /= weights.sum()
+        for _ in range(rounds):
+            root = np.linalg.cholesky(self._covariance + 1e-8 * np.eye(K))
+            samples = self._mean + rng.standard_normal((settings.samples, K)) @ root.T
+            samples[0] = self.z
+            of_samples = zip(samples, self.origin.squares(samples), strict=True)
+            heights = np.array([self.origin.height_at(z, squares) for z, squares in of_samples])
+            top = np.argsort(-heights, kind="stable")[:best]
+            self.z, self.height = samples[top[0]], float(heights[top[0]])
+            self._mean = weights @ samples[top]
+            spread = samples[top] - self._mean
+            wider, before = settings.wider_rounds
+            self._covariance = wider * (spread * weights[:, None]).T @ spread + before * self._covariance
+        return self
+
+    @property
+    def mode(self) -> ParameterMode:
+        """The mode by Gauss-Newton steps from the best sample."""
+        origin = self.origin
+        return ParameterMode.of(origin.model, origin.segments, origin.settings, self.z)
+
+
+@dataclass(frozen=True)
+class _Structures:
+    """Models with a model's parameters and effects, such as a delay, of which executions make one most probable."""
+
+    model: UncertainModel
+    candidates: Sequence[EffectCandidate]
+    settings: ParameterSettings
+
+    def with_effects(self, effects: Sequence[EffectCandidate], segments: Segments) -> UncertainModel:
+        if not effects:
+            return self.model
+        return UncertainEffects(self.model, tuple(effects), segments.commands.shape[2])
+
+    def beside(self, mode: ParameterMode) -> list[tuple[EffectCandidate, ...]]:
+        """Return the effects of a mode with each further candidate."""
+        found = _effects(mode.model)
+        kinds = [each.effect.kind for each in found]
+        return [(*found, each.sized(start)) for each in self.candidates if each.effect.kind not in kinds
+                for start in each.starts]  # fmt: skip
+
+    def from_mode(self, mode: ParameterMode, effects: Sequence[EffectCandidate], steps: int) -> ParameterMode:
+        """Return the mode with effects by Gauss-Newton steps that begin at one with fewer."""
+        model = self.with_effects(effects, mode.segments)
+        begun = np.append(mode.z, np.zeros(len(model.uncertain) - len(mode.z)))
+        return ParameterMode.of(model, mode.segments, self.settings, begun, steps)
+
+    def greedily(self, mode: ParameterMode) -> ParameterMode:
+        """Return the mode with the effects that make executions clearly more probable, one after the other."""
+        settings = self.settings
+        while len(_effects(mode.model)) < settings.effects and not mode.explains:
+            tried = [self.from_mode(mode, effects, settings.screened) for effects in self.beside(mode)]
+            if not tried:
+                break
+            few = max(tried, key=_height)
+            longer = ParameterMode.of(few.model, mode.segments, settings, few.z)
+            if longer.height < mode.height + self.price_of(mode):
+                break
+            mode = longer
         return mode
-    of_steps = replace(mode, segments=short)
-    drawn = rng.standard_normal((settings.samples, len(mode.z)))
-    heights = [of_steps.height_at(z, here) for z, here in zip(drawn, of_steps.squares(drawn), strict=True)]
-    begun = [mode.z, *drawn[np.argsort(heights)[::-1][: settings.starts]]]
-    best = max((ParameterMode.of(model, short, settings, z) for z in begun), key=lambda each: each.height)
-    return best if best.left < mode.left else mode
+
+    @property
+    def rounds(self) -> int:
+        """How many rounds the search from all of the prior takes."""
+        settings, kinds = self.settings, len({each.effect.kind for each in self.candidates})
+        return (1 + kinds) * settings.first_rounds + settings.starts * settings.further_rounds + settings.last_rounds
+
+    def from_prior(self, segments: Segments, rng: np.random.Generator) -> ParameterMode:
+        """Return the mode with one effect, or none, whose parameters and size are looked for together."""
+        settings, seen, searches = self.settings, list[object](), list[CrossEntropySearch]()
+        for each in (None, *self.candidates):
+            kind = None if each is None else each.effect.kind
+            if kind not in seen:
+                effects = () if each is None else (each.sized(each.starts[0]),)
+                search = CrossEntropySearch(self.with_effects(effects, segments), segments, settings)
+                searches.append(search.advance(settings.first_rounds, rng))
+                seen.append(kind)
+        plain = searches[0].mode
+        searches.sort(key=lambda each: -each.height)
+        best = max((each.advance(settings.further_rounds, rng) for each in searches[: settings.starts]), key=_height)
+        mode = best.advance(settings.last_rounds, rng).mode
+        return mode if mode.height > plain.height + self.price_of(plain) else plain
+
+    def price_of(self, mode: ParameterMode) -> float:
+        return self.settings.price + 0.5 * float(np.log(len(mode.here)))
 
 
-def most_probable_effects(
-    mode: ParameterMode, candidates: Sequence[EffectCandidate], known: Sequence[EffectCandidate] | None = None
-) -> ParameterMode:
-    """Return the mode of a model with the effects of inputs that make executions clearly more probable.
+def _height(found: CrossEntropySearch | ParameterMode) -> float:
+    return found.height
 
-    The effects are looked for greedily, or are the ``known`` ones, whose sizes are fitted again.
-    """
-    settings, model, inputs = mode.settings, mode.model, mode.segments.commands.shape[2]
 
-    def with_effects(
-        effects: tuple[EffectCandidate, ...], begun: ParameterMode, steps: int | None = None
-    ) -> ParameterMode:
-        extended = UncertainEffects(model, effects, inputs)
-        z = np.append(begun.z, np.zeros(len(extended.uncertain) - len(begun.z)))
-        return ParameterMode.of(extended, mode.segments, settings, z, steps)
-
-    if known is not None:
-        return with_effects(tuple(known), mode) if known else mode
-    best, found = mode, tuple[EffectCandidate, ...]()
-    while len(found) < settings.effects and best.left > settings.explained**2:
-        tried = [
-            (*found, each.sized(start))
-            for each in candidates
-            if each.effect.kind not in [other.effect.kind for other in found]
-            for start in each.starts
-        ]
-        if not tried:
-            break
-        few = max((with_effects(each, best, settings.screened) for each in tried), key=lambda each: each.height)
-        longer = ParameterMode.of(few.model, mode.segments, settings, few.z)
-        if longer.height < best.height + settings.price + 0.5 * np.log(len(mode.here)):
-            break
-        best, found = longer, (few.model.effects if isinstance(few.model, UncertainEffects) else found)
-    return best
+def _effects(model: UncertainModel) -> tuple[EffectCandidate, ...]:
+    return model.effects if isinstance(model, UncertainEffects) else ()
 
 
 def most_probable(
@@ -302,26 +367,40 @@ def most_probable(
     known: Sequence[EffectCandidate] | None,
     rng: np.random.Generator,
     settings: ParameterSettings,
+    affords: Callable[[int], bool] = lambda steps: True,
 ) -> ParameterMode | None:
     """Return the mode of parameters and effects; None without segments.
 
-    If it explains too little, what explains one execution alone is fitted to all: a mode of few contacts is found more
-    easily, and it ends at the mode of many.
+    Effects are looked for among candidates, or are the ``known`` ones, whose sizes are fitted again. Gauss-Newton steps
+    begin at the prior's mean. If they explain too little, the mode of single steps, of which more are without a change
+    of contacts, is looked for from all of the prior: of the parameters, then with each effect, if so many steps of the
+    model can be afforded.
     """
-
-    def of(runs: Sequence[Trajectory]) -> ParameterMode | None:
-        found = most_probable_parameters(model, runs, rng, settings)
-        return None if found is None else most_probable_effects(found, candidates, known)
-
-    mode = of(executed)
-    for run in executed[: settings.starts] if mode is not None and len(executed) > 1 else ():
-        if mode is None or mode.left <= settings.explained**2:
-            break
-        alone = of([run])
-        if alone is not None and alone.left <= settings.explained**2:
-            fitted = ParameterMode.of(alone.model, mode.segments, settings, alone.z)
-            mode = fitted if fitted.height > mode.height else mode
-    return mode
+    segments, structures = Segments.of(model, executed, rng, settings), _Structures(model, candidates, settings)
+    if segments is None:
+        return None
+    mode = ParameterMode.of(model, segments, settings)
+    if known:
+        mode = structures.from_mode(mode, known, settings.newton)
+    short = None if mode.explains else Segments.of(model, executed, rng, replace(settings, steps=1))
+    if short is None:
+        return mode
+    rounds = settings.first_rounds + settings.further_rounds, settings.last_rounds
+    of_round = settings.samples * len(short.states)
+    if affords(sum(rounds) * of_round):
+        search = CrossEntropySearch(mode.model, short, settings)
+        for each in rounds:
+            found = search.advance(each, rng).mode
+            mode = found if found.left < mode.left else mode
+            if mode.explains:
+                break
+    if known is not None or mode.explains:
+        return mode
+    mode = structures.greedily(mode)
+    if mode.explains or not affords(structures.rounds * of_round):
+        return mode
+    found = structures.greedily(structures.from_prior(short, rng))
+    return found if found.left < mode.left else mode
 
 
 def blocks_of(lengths: Sequence[int], count: int, horizon: int, block: int, rng: np.random.Generator) -> Rows:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
@@ -303,14 +303,16 @@ def learned_parameters(
     candidates: Found = (),
     known: Found | None = None,
     settings: ParametricSettings = ParametricSettings(),
+    affords: Callable[[int], bool] = lambda steps: True,
 ) -> ParametricPosterior | None:
     """Return the posterior of a model's uncertain parameters and of what they leave; None if nothing is usable.
 
     Effects of inputs are looked for among candidates, or are the ``known`` ones; ``loops`` are closed loops on M.
+    Searches from all of the prior need that so many steps of M can be afforded.
     """
     rng = np.random.default_rng(seed)
     with single_threaded(), np.errstate(all="ignore"):
-        mode = most_probable(model, executed, candidates, known, rng, settings.parameters)
+        mode = most_probable(model, executed, candidates, known, rng, settings.parameters, affords)
         if mode is None:
             return None
         parameters = mode.posterior(rng)

@@ -210,6 +210,10 @@ class Costs:
         each = s.horizon * (user + self._own(calls * settings.step + rows * own))
         return each + self._own(settings.distance * systems * batches)
 
+    def steps(self, count: float) -> float:
+        """Return the seconds of so many steps of M in large batches."""
+        return count * self.thinking.speed.another_step
+
     # Learning
 
     def _density(self) -> float:

@@ -27,6 +27,10 @@ class Correction(ShortRepr):
     A pair is standardised, ``z = ((x, u) - shift) / scale``. Outside the box of the recorded pairs, the correction
     fades: it is multiplied by ``exp(-1/2 sum_j (e_j / fade_j)^2)``, where e_j is the distance to the box. Far from all
     records it is zero, and the model is as before.
+
+    Raises:
+        InputError: if a scale is not positive.
+        ShapeError: if the arrays do not belong together.
     """
 
     shift: Array  # constants of the standardised pairs (n + m,)

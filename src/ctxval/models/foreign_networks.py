@@ -33,6 +33,9 @@ class Onnx:
         source: the file, or its bytes.
         increments: whether the network returns ``x_next - x`` instead of ``x_next``.
         data: the transitions that the network was learned from, if they are known.
+
+    Raises:
+        InputError: if the network does not take (x, u).
     """
 
     def __init__(
@@ -74,6 +77,9 @@ class Torch:
         module: a ``torch.nn.Module`` or a function of tensors.
         increments: whether the module returns ``x_next - x`` instead of ``x_next``.
         data: the transitions that the module was learned from, if they are known.
+
+    Raises:
+        InputError: if the module does not take (x, u).
     """
 
     def __init__(self, module: Any, *, increments: bool = False, data: Transitions | None = None) -> None:

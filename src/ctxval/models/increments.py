@@ -113,6 +113,9 @@ class FeedforwardReLU(IncrementModel):
         biases: one vector for each layer.
         scaling: the scaling of the state-input pair and of the increment.
         data: the transitions that the model was learned from, if any.
+
+    Raises:
+        ShapeError: if the layers do not fit together.
     """
 
     def __init__(
@@ -201,6 +204,9 @@ class GaussianProcessModel(IncrementModel):
         weights: ``(K + noise I)^-1 Y``, shape ``(M, n)``.
         scaling: of the state-input pair and of the increment.
         data: the transitions that it was learned from, if any.
+
+    Raises:
+        ShapeError: if the arrays do not belong together.
     """
 
     def __init__(

@@ -22,6 +22,9 @@ class Linear:
         B: matrix of the inputs, shape ``(n, m)``.
         c: constant term, shape ``(n,)``; zero by default.
         data: the transitions that the model was learned from, if any.
+
+    Raises:
+        ShapeError: if the matrices, or the data, do not fit together.
     """
 
     def __init__(self, A: ArrayLike, B: ArrayLike, c: ArrayLike | None = None, data: Transitions | None = None) -> None:
@@ -39,7 +42,11 @@ class Linear:
 
     @classmethod
     def fit(cls, data: Transitions, *, intercept: bool = True) -> Linear:
-        """Fit A, B and c by least squares on recorded transitions; without an intercept, c is zero."""
+        """Fit A, B and c by least squares on recorded transitions; without an intercept, c is zero.
+
+        Raises:
+            InputError: if the data are not finite, or determine no model.
+        """
         require("data", Transitions, data)
         n, m = data.x.shape[1], data.u.shape[1]
         if not all(np.isfinite(array).all() for array in (data.x, data.u, data.x_next)):
@@ -82,6 +89,10 @@ def state_space(system: Any, dt: Seconds) -> Linear:
     The model has the state of the system, so C must be the identity and D must be 0, if there are any. A continuous
     system, whose own dt is 0 or None, is discretised exactly for inputs that are held over a step. A discrete system
     whose dt is True has any time step.
+
+    Raises:
+        InputError: if C, D or dt are not those of a model.
+        ShapeError: if A and B do not fit together.
     """
     if not all(hasattr(system, name) for name in ("A", "B")):
         raise InputError(f"a state-space model must have A and B, got {system!r}.")

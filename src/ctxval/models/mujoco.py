@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Rows
 from ctxval._util.checked import Seconds, require_known
 from ctxval._util.mjcf import Simulator, compile_mjcf, is_mjcf_text, quiet
 from ctxval._util.refusals import require_extra
@@ -48,10 +48,14 @@ class MuJoCo:
         invariant: what the dynamics do not depend on: ``["x", "y", "yaw"]`` of the only free joint, on flat ground
             without walls, or names of hinges and slides. What M misses is then learned as a function of the other
             states, in the heading frame, and records need not cover these. If executions contradict, all states count.
+
+    Raises:
+        InputError: if dt is no multiple of the MJCF's time step.
     """
 
     uncertain: tuple[UncertainParameter, ...] = ()
     _parameters: tuple[MuJoCoParameter, ...] = ()
+    _changes: tuple[Callable[[Any], None], ...] = ()  # of the compiled model
     _forces: Array | None = None  # of every step; see `changed`
 
     def __init__(
@@ -65,7 +69,8 @@ class MuJoCo:
         uncertain: Mapping[str, float | str] | None = None,
         invariant: Sequence[str] = (),
     ) -> None:
-        _, model = compile_mjcf(mjcf if is_mjcf_text(mjcf) else identified_in(Path(mjcf)))
+        self._mjcf = mjcf if is_mjcf_text(mjcf) else identified_in(Path(mjcf)).absolute()
+        _, model = compile_mjcf(self._mjcf)
         timestep = float(model.opt.timestep)
         ratio = 1.0 if dt is None else dt / timestep
         self.substeps = round(ratio)
@@ -108,18 +113,31 @@ class MuJoCo:
         """
         another = copy.copy(self)
         if change is not None:
-            mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo need")
             model = copy.copy(self.compiled)
             change(model)
-            mujoco.mj_setConst(model, mujoco.MjData(model))
-            another._simulate(model)
+            another._changes = (*self._changes, change)
+            another._simulate_changed(model, np.flatnonzero((model.body_ipos != self.compiled.body_ipos).any(axis=1)))
         if forces is not None:
             another._forces = forces
         return another
 
+    def _simulate_changed(self, model: Any, moved: Rows) -> None:
+        """Simulate a changed model; bodies whose centres of mass have moved, or shall move, are not simple."""
+        mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo need")
+        if model.body_simple[moved].any():
+            _, model = compile_mjcf(self._mjcf, simple=False)
+            for change in self._changes:
+                change(model)
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        self._simulate(model)
+
     def _add_uncertain(self, uncertain: Mapping[str, float | str]) -> None:
         self._parameters = (*self._parameters, *uncertain_parameters(self.compiled, uncertain))
         self.uncertain = tuple(each.prior for each in self._parameters)
+        moving = [places[0] for each in self._parameters for field, places in each.places if field == "body_ipos"]
+        bodies = np.unique(np.concatenate([np.ravel(each) for each in moving])) if moving else np.empty(0, np.intp)
+        if self.compiled.body_simple[bodies].any():
+            self._simulate_changed(self.compiled, bodies)
 
     def with_uncertain(self, uncertain: Mapping[str, float | str]) -> MuJoCo:
         """Return the model with further uncertain parameters, which follow its own."""

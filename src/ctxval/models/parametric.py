@@ -32,6 +32,9 @@ class Parametric:
         dt: length of a step in seconds, if it is known.
         states, inputs: the names of the states and inputs with their units, if they are known.
         data: the transitions that the parameters were learned from, if any.
+
+    Raises:
+        InputError: if theta is no table of parameters.
     """
 
     uncertain: tuple[UncertainParameter, ...] = ()
@@ -139,7 +142,11 @@ class Expected:
         self.draws = np.concatenate([half, -half])
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the expected next state; shapes ``(..., n), (..., m) -> (..., n)``."""
+        """Return the expected next state; shapes ``(..., n), (..., m) -> (..., n)``.
+
+        Raises:
+            ModelError: if the draws have another shape.
+        """
         batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
         count, noise = self.draws.shape
         states, inputs = (np.broadcast_to(each, (count, *batch, each.shape[-1])) for each in (x, u))

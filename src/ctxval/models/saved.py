@@ -71,7 +71,11 @@ def read_note(source: str | Path) -> dict[str, Any]:
 
 
 def write_transitions(path: str | Path, data: Transitions | None) -> None:
-    """Write recorded steps as an NPZ file with x, u and x_next, as the argument ``data`` of a model takes it."""
+    """Write recorded steps as an NPZ file with x, u and x_next, as the argument ``data`` of a model takes it.
+
+    Raises:
+        InputError: if there are none.
+    """
     if data is None:
         raise InputError(f"there are no recorded steps to write to {path}.")
     _write(path, _data_arrays(data))
@@ -124,7 +128,11 @@ def read_model(source: str | Path) -> SavedModel:
 
 
 def read_refined(source: str | Path, before: Model | None) -> SavedModel:
-    """Return a model from a file, as :func:`read_model` does; a correction alone is added to the model before."""
+    """Return a model from a file, as :func:`read_model` does; a correction alone is added to the model before.
+
+    Raises:
+        InputError: if the file has another format.
+    """
     known_kinds = "an NPZ file of ctxval, or one with the matrices A (n, n) and B (n, m)"
     with reworded(f"{source} cannot be read as a model ({known_kinds})", ValueError, TypeError, IndexError):
         arrays = Archive(read_bytes(source))

@@ -26,6 +26,9 @@ class ScikitLearn:
         regressor: the fitted regressor, whose ``predict`` maps features ``(N, n + m)`` to ``(N, n)``.
         increments: whether the regressor predicts ``x_next - x`` instead of ``x_next``.
         data: the transitions that the regressor was fitted on, if any.
+
+    Raises:
+        InputError: if the regressor is not fitted.
     """
 
     def __init__(self, regressor: Any, *, increments: bool = True, data: Transitions | None = None) -> None:
@@ -37,7 +40,11 @@ class ScikitLearn:
 
     @classmethod
     def fit(cls, regressor: Any, data: Transitions, *, increments: bool = True) -> ScikitLearn:
-        """Fit a regressor on recorded transitions. The regressor itself is fitted, not a copy."""
+        """Fit a regressor on recorded transitions. The regressor itself is fitted, not a copy.
+
+        Raises:
+            InputError: if the regressor has no ``fit``.
+        """
         require_finite(data)
         if not callable(getattr(regressor, "fit", None)):
             raise InputError(f"the regressor must have fit and predict, got {regressor!r}.")
@@ -47,7 +54,11 @@ class ScikitLearn:
         return cls(regressor, increments=increments, data=data)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next states ``(..., n)``, NaN for a pair that is not finite."""
+        """Return the next states ``(..., n)``, NaN for a pair that is not finite.
+
+        Raises:
+            ShapeError: if the regressor predicts another number of states.
+        """
         rows, batch = self._rows(x, u)
         finite: Mask = np.asarray(np.isfinite(rows).all(axis=-1, keepdims=True))
         complete = rows if finite.all() else np.where(finite, rows, 0.0)

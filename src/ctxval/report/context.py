@@ -308,6 +308,9 @@ def context_of_store(
     """Return what a report of a store is made from, if its experiment is not loaded. No code is imported or run.
 
     Without ``threshold`` there is no verdict; ``missing`` says why the experiment is not loaded, as a sentence.
+
+    Raises:
+        InputError: if the store has no readable task space.
     """
     with store.snapshot():
         name, trials = store.description().get("name"), tuple(store.trials())

@@ -69,7 +69,11 @@ SECTIONS: tuple[Section, ...] = (
 
 
 def page(context: ReportContext, sections: Sequence[Section] = ()) -> str:
-    """Return a report as one HTML page; ``sections`` follow those that every report has and installed packages add."""
+    """Return a report as one HTML page; ``sections`` follow those that every report has and installed packages add.
+
+    Raises:
+        InputError: if a section has no title or no ``render``.
+    """
     installed: list[Section] = []
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         with reworded(f"the section {point.name!r} cannot be loaded"):  # another package's code

@@ -31,6 +31,9 @@ class CMAES(SequentialSearch):
     Args:
         sigma: standard deviation of the first generation on each axis, in widths of the cube.
         population: number of points in a generation; ``4 + floor(3 ln d)`` by default.
+
+    Raises:
+        InputError: if the population is smaller than 4.
     """
 
     def __init__(self, sigma: PositiveFloat = 0.3, population: PositiveInt | None = None) -> None:

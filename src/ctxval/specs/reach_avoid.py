@@ -42,6 +42,9 @@ class ReachAvoid(NamedStates):
     The robustness is the smaller one of the least signed distance to the sets that are avoided, over all recorded
     times, and the depth in the reach set at its deepest within the times. What happens between two recorded times is
     not seen.
+
+    Raises:
+        InputError: if there is no set, or if components or times are not valid.
     """
 
     avoid: Any = ()  #: the sets that are never entered; one set, a list, or their tables

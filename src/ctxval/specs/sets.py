@@ -110,7 +110,12 @@ class Ball(_Placed):
 @checked
 @dataclass(frozen=True, eq=False)
 class Box(_Placed):
-    """All positions between two corners, which are relative to the center."""
+    """All positions between two corners, which are relative to the center.
+
+    Raises:
+        InputError: if it has no end or no inside.
+        ShapeError: if low and high differ in length.
+    """
 
     _: dataclasses.KW_ONLY
     low: Any = None  #: the corners, ``(k,)``; infinite or None where there is no end. One of them may be left out.
@@ -155,6 +160,10 @@ class Polytope(_Placed):
     """All positions with ``A x <= b``, where x is relative to the center.
 
     The signed distance is the largest one to the planes of the faces. Outside it is at most the Euclidean distance.
+
+    Raises:
+        InputError: if it has no inside.
+        ShapeError: if A and b do not fit together.
     """
 
     _: dataclasses.KW_ONLY

@@ -25,6 +25,10 @@ class STL(NamedStates):
     the time step. An entry ``obstacle`` of the task's environment is known to the formula as ``obstacle_0``,
     ``obstacle_1`` and so on. The robustness changes by at most as much as the states if each predicate compares one
     state with a constant; with other predicates, scale them.
+
+    Raises:
+        InputError: if there are no variables.
+        ShapeError: if there is not a variable for each component.
     """
 
     formula: str  #: the formula

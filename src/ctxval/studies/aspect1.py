@@ -29,7 +29,7 @@ from ctxval.core.floating_base import UntilFall
 from ctxval.core.plan import Plan
 from ctxval.core.soundness import Flips, InputSaturation, aimed_states, flips, saturation
 from ctxval.core.task import COMMAND, Task
-from ctxval.core.trial import FELL, Trial, Trials
+from ctxval.core.trial import Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.distances import BodyVelocity, CommandError, GoalError, MeanDeviation, StateNorm, TrackingError
 from ctxval.errors import CtxvalError, DesignError, InputError, ModelError
@@ -163,6 +163,9 @@ def completion(validation: Validation) -> Distance:
     :class:`ctxval.distances.TrackingError`. For a :class:`ctxval.distances.BodyVelocity` and tasks with a command it is
     :class:`ctxval.distances.CommandError`. If the distance compares all states, those are left out that the
     synthesizer does not bring to a goal.
+
+    Raises:
+        InputError: if tasks have no goal.
     """
     space, distance = validation.space, validation.distance
     distance = distance.distance if isinstance(distance, UntilFall) else distance
@@ -223,7 +226,7 @@ def _report(campaign: Campaign, distance: Distance, threshold: float | None, see
 
 
 def _simulated(trial: Trial) -> SimulatedTask:
-    return SimulatedTask(trial.parameters, trial.distance, text_of(trial.failure or ""), FELL in (trial.note or {}))
+    return SimulatedTask(trial.parameters, trial.distance, text_of(trial.failure or ""), trial.note.falls is not None)
 
 
 def _with_neighbours(points: Array, rng: np.random.Generator) -> Array:

@@ -48,6 +48,9 @@ class FMU:
             state that the FMU calculates (``initial="calculated"``) often needs one, such as ``{"T": "T_start"}``.
         parameters: values of other variables, set before the initialisation.
         substeps: number of communication steps in one control step.
+
+    Raises:
+        InputError: if there are no states, or if a variable is missing.
     """
 
     def __init__(

@@ -68,6 +68,9 @@ class Manual:
     """A system whose tasks people execute: get a task with ``campaign.ask()``, report it with ``campaign.tell()``.
 
     States and inputs are names of the components with their units, for files.
+
+    Raises:
+        InputError: if there are no states.
     """
 
     manual = True  #: mark of a system that a program cannot execute
@@ -106,6 +109,9 @@ class Imperfect:
         push: what a push adds to states, by their indices, such as ``{7: 0.5}``; None if there is none.
         push_time: seconds after which it does, rounded to a step.
         seed: with a seed, noise is a function of it, of the task and of how often this object has executed.
+
+    Raises:
+        InputError: if a size is negative or not finite.
     """
 
     batched = True

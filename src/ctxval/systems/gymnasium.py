@@ -45,6 +45,9 @@ class Gymnasium:
         seed: seed of every reset, so that executions are repeatable; None takes another one each time.
         ignore_termination: continue although the environment reports the end of the episode.
         options: further arguments for ``gymnasium.make`` or for the function, such as ``max_episode_steps=-1``.
+
+    Raises:
+        InputError: if the environment has no continuous actions, another dt, or no state that can be set.
     """
 
     def __init__(

@@ -44,6 +44,9 @@ class PyBullet:
         mjcf: the MJCF of M, for a URDF, which gets its joints, actuators, gravity, timestep and fixed geoms.
         timestep: of the engine, seconds; by default that of the MJCF.
         substeps: number of these in one control step.
+
+    Raises:
+        InputError: if a URDF has no MJCF, or an MJCF has one.
     """
 
     def __init__(

@@ -146,6 +146,9 @@ class Subprocess:
         states, inputs: names of the states and inputs with their units, for the files.
         keep: a folder in which the folders of all executions are kept, to examine failures.
         folder: folder in which the files that the command names are searched before the current one.
+
+    Raises:
+        InputError: if the command names no program.
     """
 
     patience = 10.0  # seconds that a supervisor has to kill its command before it is killed itself

@@ -152,7 +152,7 @@ _SEARCHES = {
 
 
 def why(trial: Trial, units: str) -> list[str]:
-    note = trial.note or {}
+    note = trial.note.search or {}
     sentences, expected = [_ORIGINS[trial.origin]], note.get("expected")
     if trial.origin == "acquisition" and isinstance(expected, int | float) and abs(expected) < math.inf:
         distance = f"{number(expected)} {text(units)}".rstrip()
@@ -163,7 +163,7 @@ def why(trial: Trial, units: str) -> list[str]:
         sentences.append(f"The search does not use the prediction of the learned dynamics: {text(note['why'])}.")
     if trial.because is not None:
         sentences.append(f"Since the last execution of this task: {text(trial.because)}.")
-    prediction = prediction_in(note)
+    prediction = prediction_in(trial.note)
     if prediction is not None and math.isfinite(prediction.median):
         median, upper = (f"{number(value)} {text(units)}".rstrip() for value in (prediction.median, prediction.upper))
         sentences.append(f"Predicted distance: {median}; below {upper} with probability 0.95.")

@@ -15,6 +15,7 @@ from hypothesis.extra import numpy as arrays
 from ctxval import Store, Trajectory, Trial
 from ctxval.campaign.storage.rows import row_of
 from ctxval.core.trial import Change
+from ctxval.core.trial_note import TrialNote
 from ctxval.errors import CtxvalError, InputError
 
 STRANGE = (0, -0.0, 0.5, 1, np.nan, np.inf, -np.inf, 5e-324, -5e-324, 1.7e308, 2**53 - 1, 2**53, 2**63, 2**70, -1, True)
@@ -44,7 +45,7 @@ def stored(store: Store) -> list[tuple[Any, ...]]:
             "attempts": NUMBERS,
             "unit_point": POINTS.map(np.array),
             "parameters": st.dictionaries(st.text(), NUMBERS | POINTS | st.text(), max_size=2),
-            "note": NOTES,
+            "note": NOTES.map(TrialNote),
             "because": st.text() | st.just("\udcff\0"),
         },
     )
@@ -67,7 +68,7 @@ def test_a_result_reads_back_or_is_refused_and_the_trial_stays_open(
 ) -> None:
     store = Store()
     store.add([(TRIAL, RUN, None)])
-    ended = replace(TRIAL, state="completed", executed=True, distance=distance, seconds=seconds, note=note)
+    ended = replace(TRIAL, state="completed", executed=True, distance=distance, seconds=seconds, note=TrialNote(note))
     try:
         store.close_trials([(ended, RUN)])
     except InputError:
@@ -130,7 +131,7 @@ def test_what_is_nested_too_deeply_to_be_read_is_not_stored(depth: int) -> None:
     store = Store()
     for write in (
         lambda: store.keep_settings({"value": value}),
-        lambda: store.add([(replace(TRIAL, note={"value": value}), None, None)]),
+        lambda: store.add([(replace(TRIAL, note=TrialNote({"value": value})), None, None)]),
     ):
         if depth > 50:
             with pytest.raises(InputError):

@@ -16,13 +16,14 @@ from hypothesis import strategies as st
 
 from ctxval import Store, Trajectory, Trial
 from ctxval.campaign.storage.rows import COLUMNS, Side, checksum_of, follows, read_json, read_trial, row_of
+from ctxval.core.trial_note import TrialNote
 from ctxval.errors import ForeignStoreError, InputError
 from facts import refuses
 
 NAMES = [name.strip() for name in COLUMNS.split(",")]
 WHOLE = Trial(
     *(0, "iid", "completed", np.array([0.25, 1.0]), {"a": 1.5, "b": [1.0, -2.0]}, 1, True, 0.5),
-    *(None, 2.0, {"engine": "climb", "expected": 0.5}),
+    *(None, 2.0, TrialNote({"engine": "climb", "expected": 0.5})),
 )
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from ctxval import Store, Trajectory, Trial
 from ctxval.core.trial import Change
+from ctxval.core.trial_note import NO_NOTE, TrialNote
 from ctxval.errors import ForeignStoreError, InputError, StoreAccessError
 from facts import refuses
 
@@ -41,12 +42,12 @@ def test_a_trial_comes_back_bit_for_bit(tmp_path: Path) -> None:
 
 def test_a_note_comes_back_bit_for_bit_and_none_as_none(tmp_path: Path) -> None:
     store = Store(tmp_path / "a.sqlite")
-    note = {"engine": "climb", "climb": 2, "expected": 0.1 + 0.2, "radius": 1.0, "why": None}
+    note = TrialNote({"engine": "climb", "climb": 2, "expected": 0.1 + 0.2, "radius": 1.0, "why": None}, draws=2)
     store.add([(replace(trial(), note=note), TRAJECTORY, None)])
     store.add([(trial(1), TRAJECTORY, None)])
     store.add([(replace(trial(2), state="failed", failure="x", note=note), None, None)])
     store.close()
-    assert [t.note for t in Store(tmp_path / "a.sqlite").trials()] == [note, None, note]
+    assert [t.note for t in Store(tmp_path / "a.sqlite").trials()] == [note, NO_NOTE, note]
 
 
 def test_trajectories_come_back_bit_for_bit_and_absent_ones_as_none() -> None:

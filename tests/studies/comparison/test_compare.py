@@ -29,9 +29,10 @@ from ctxval import (
 )
 from ctxval.campaign.storage.store import Store
 from ctxval.core.plan import gives_inputs
+from ctxval.core.trial_note import TrialNote
 from ctxval.errors import InputError, UnknownNameError
 from ctxval.studies.comparison import CandidateResult, PairResult
-from ctxval.studies.comparison.candidates import TrialNote
+from ctxval.studies.comparison.candidates import ComparisonNote
 from facts import assert_names, refuses
 from rig_suites import COARSE
 from rig_suites import validation as suite_of
@@ -127,7 +128,7 @@ def test_distances_of_one_controller_share_every_execution() -> None:
         {trial.number: one.trajectories(trial)[1] for trial in one.trials if trial.executed} for one in pair.values()
     ]
     assert [len(one) for one in trajectories] == [found.executions] * 2
-    shared = [TrialNote.of(trial) for one in pair.values() for trial in one.trials]
+    shared = [ComparisonNote.of(trial) for one in pair.values() for trial in one.trials]
     assert sum(note is not None and note.shared is not None for note in shared) == found.executions
 
 
@@ -184,7 +185,7 @@ def test_a_comparison_that_is_stopped_continues_with_the_same_choices(tmp_path: 
     assert parts.to_json() == whole.to_json()
     for name in ("gentle", "stiff"):
         kept = [Store(tmp_path / folder / f"{name}.sqlite").trials() for folder in ("whole", "parts")]
-        plain = [[(t.unit_point.tolist(), t.distance, json.dumps(t.note)) for t in trials] for trials in kept]
+        plain = [[(t.unit_point.tolist(), t.distance, json.dumps(t.note.to_json())) for t in trials] for trials in kept]
         assert plain[0] == plain[1]
     again = compare(stores("parts"), budget=10)
     assert again.to_json() == whole.to_json()
@@ -303,11 +304,11 @@ def test_a_result_is_json_whatever_the_names_are() -> None:
 @pytest.mark.slow
 def test_notes_of_others_are_no_notes_of_a_comparison() -> None:
     trial = Campaign(make_validation()).ask({"goal": 0.5}).trial
-    for note in (None, {"comparison": 3}, {"comparison": {"step": "x"}}, {"other": {}}):
-        assert TrialNote.of(replace(trial, note=note)) is None
-    kept = TrialNote(4, "mean", 2, 0.5, 0.25, ("a", 3))
-    for stored in (kept.to_note(), json.loads(json.dumps(kept.to_note()))):
-        found = TrialNote.of(replace(trial, note=stored))
+    for note in ({}, {"comparison": 3}, {"comparison": {"step": "x"}}, {"other": {}}):
+        assert ComparisonNote.of(replace(trial, note=TrialNote.from_json(note))) is None
+    kept = ComparisonNote(4, "mean", 2, 0.5, 0.25, ("a", 3))
+    for stored in (kept.to_json(), json.loads(json.dumps(kept.to_json()))):
+        found = ComparisonNote.of(replace(trial, note=TrialNote(comparison=stored)))
         assert found is not None
         assert vars(found) == vars(kept)
 

@@ -173,7 +173,10 @@ def export(recovered: Recovered, folder: Path) -> list[Path]:
             writer = csv.writer(file)
             writer.writerow([_cell(name) for name in header])
             writer.writerows([_cell(row.get(name)) for name in header] for row in rows)
-        trials = [asdict(trial) | {"unit_point": trial.unit_point.tolist()} for trial in recovered.trials.values()]
+        trials = [
+            asdict(trial) | {"unit_point": trial.unit_point.tolist(), "note": trial.note.to_json() or None}
+            for trial in recovered.trials.values()
+        ]
         # A hundred levels are more than are ever read.
         content = describe({**recovered.about, "damaged": recovered.damaged, "trials": trials}, 100)
         write_text(paths[1], json.dumps({"made_by": MADE_BY, **content}, indent=1, allow_nan=False))

@@ -16,6 +16,7 @@ from ctxval._util.refusals import reworded
 from ctxval._util.texts import shortened, text_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Origin, State, Trial
+from ctxval.core.trial_note import TrialNote
 from ctxval.errors import InputError
 
 COLUMNS = "number, origin, state, unit_point, parameters, attempts, executed, distance, failure, seconds, note, because"
@@ -38,7 +39,7 @@ def row_of(trial: Trial) -> tuple[Any, ...]:
                 as_json(as_floats("unit_point", trial.unit_point)),
             ),
             *(as_json(trial.parameters), int(index(trial.attempts)), int(trial.executed)),
-            *(distance, failure, seconds, as_json(trial.note), because),
+            *(distance, failure, seconds, as_json(trial.note.to_json() or None), because),
         )
         read_trial(row, checksum_of(row))
     return row
@@ -90,8 +91,9 @@ def read_trial(row: tuple[Any, ...], checksum: Any) -> Trial:
             got = shortened(repr(dict(zip(COLUMNS.split(", "), row, strict=True))[name]), 100)
             raise InputError(f"its {name} must be {wanted}, got {got}")
     where = np.array(unit_point, dtype=np.float64)
-    known = Trial(number, origin, state, where, parameters, attempts, bool(executed), note=notes, because=because)
-    return replace(known, distance=distance, failure=failure, seconds=seconds)
+    known = Trial(number, origin, state, where, parameters, attempts, bool(executed), because=because)
+    note_of = TrialNote.from_json(notes or {})
+    return replace(known, distance=distance, failure=failure, seconds=seconds, note=note_of)
 
 
 def _count(value: Any) -> bool:

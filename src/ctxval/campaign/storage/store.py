@@ -53,7 +53,12 @@ class Store(Database):
 
     @classmethod
     def existing(cls, path: str | Path) -> Store:
-        """Open a store that must exist already; otherwise, and for other files, as the constructor raises."""
+        """Open a store that must exist already; otherwise, and for other files, as the constructor raises.
+
+        Raises:
+            StoreAccessError: if there is no file, or if it may not be read.
+            ForeignStoreError: if it is no store.
+        """
         schema.require_files(Path(path))
         if not os.path.exists(path):
             raise StoreAccessError(f"there is no store at {path}.")

@@ -122,6 +122,11 @@ class SharedAttribute(OfMuJoCo):
         for axis in "xy" if ground and most > 0 else "":
             tilt = Parameter(f"gravity_{axis}", -0.5 * most, 0.5 * most, 0.01 * most, "m/s^2")
             yield of_size(cls((0.0,), f"gravity_{axis}", True), tilt, 0.0)
+        for body in _floating(compiled) if joints < 2 else ():  # otherwise, MassCentre is this effect
+            name, extent = compiled.body(body).name, _extent(compiled, body)
+            for axis in "xyz":
+                parameter = Parameter("centre of mass", -3 * extent, 3 * extent, 0.05 * extent, "m")
+                yield of_size(cls((0.0,), f"centre_{axis}[{name}]", True), parameter, 0.0)
 
     @property
     def unit(self) -> float | str:
@@ -145,6 +150,9 @@ class SharedAttribute(OfMuJoCo):
         if self.parameter.startswith("gravity"):
             slope = np.degrees(np.arctan(size / np.linalg.norm(plant.compiled.opt.gravity)))
             return f"gravity has a part of {size:.3g} m/s^2 along {axis}, as on a slope of {abs(slope):.2g} degrees"
+        if self.parameter.startswith("centre"):
+            body = self.parameter.partition("[")[2].rstrip("]")
+            return f"the centre of mass of {body} is shifted by {size:.3g} m along its {self.parameter[7]} axis"
         if self.added:
             return f"all driven joints stick ({size:.3g} N m)"
         return f"{self.parameter} is {size:.3g} times that of M"
@@ -218,7 +226,7 @@ class MassCentre(OfMuJoCo):
     def candidates(cls, observed: Observed) -> Iterator[EffectCandidate]:
         compiled = observed.plant.compiled
         for body in _heaviest(compiled):
-            extent = float(np.sqrt(compiled.body_inertia[body].max() / compiled.body_mass[body]))
+            extent = _extent(compiled, body)
             for axis in range(3 if extent > 0 else 0):
                 shift = Parameter(cls.name, -3 * extent, 3 * extent, 0.05 * extent, "m")
                 yield of_size(cls((0.0,), body, axis), shift, 0.0)
@@ -245,6 +253,18 @@ def _inertias(compiled: Any) -> Array:
     mujoco.mj_forward(compiled, data)
     mujoco.mj_fullM(compiled, data, inertias)
     return np.asarray(np.abs(np.diagonal(inertias)))
+
+
+def _extent(compiled: Any, body: int) -> float:
+    """Return the largest radius of gyration of a body, metres."""
+    return float(np.sqrt(compiled.body_inertia[body].max() / compiled.body_mass[body]))
+
+
+def _floating(compiled: Any) -> list[int]:
+    """Return the bodies with free joints, which have names, masses and an extent."""
+    bodies = compiled.jnt_bodyid[compiled.jnt_type == 0].tolist()
+    named = [body for body in bodies if compiled.body(body).name and compiled.body_mass[body] > 0]
+    return [body for body in named if _extent(compiled, body) > 0]
 
 
 def _heaviest(compiled: Any) -> list[int]:

@@ -40,18 +40,23 @@ class UncertainEffects(ShortRepr):
         ]
         return *self.given.uncertain, *sizes
 
+    @functools.cached_property
+    def _with_attributes(self) -> UncertainModel:
+        """The model whose uncertain parameters the shared attributes are, too, so that all draws run in one batch."""
+        shared = [each.effect for each in self.effects if isinstance(each.effect, SharedAttribute)]
+        if not shared or not isinstance(self.given, MuJoCo):
+            return self.given
+        return self.given.with_uncertain({each.parameter: each.unit for each in shared})
+
     def drawn(self, z: Array) -> Model:
         """Return S models with standardised parameters ``(S, K)``; see :class:`UncertainModel`."""
-        model, of_model = self.given, len(self.given.uncertain)
+        of_model = len(self.given.uncertain)
         sizes = (each.at(z[:, k, None]) for k, each in enumerate(self.uncertain) if k >= of_model)
         effects = [each.effect for each in all_sized(self.effects, sizes)]
-        z = z[:, :of_model]
-        shared = [each for each in effects if isinstance(each, SharedAttribute)]
-        if shared and isinstance(model, MuJoCo):  # so all draws run in one batch
-            model = model.with_uncertain({each.parameter: each.unit for each in shared})
-            z = np.concatenate([z, *(each.standardised for each in shared)], axis=1)
+        shared = [each.standardised for each in effects if isinstance(each, SharedAttribute)]
+        model = self._with_attributes.drawn(np.concatenate([z[:, :of_model], *shared], axis=1))
         of_inputs = tuple(each for each in effects if not isinstance(each, SharedAttribute))
-        return ModelWithEffects(model.drawn(z), of_inputs, self.inputs) if of_inputs else model.drawn(z)
+        return ModelWithEffects(model, of_inputs, self.inputs) if of_inputs else model
 
     @functools.cached_property
     def _usual(self) -> ModelWithEffects:

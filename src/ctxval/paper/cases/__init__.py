@@ -27,7 +27,11 @@ REGISTRY: Registry[Experiment] = Registry(
 
 
 def by_name(name: str, /, seed: int = 0, **options: Any) -> Experiment:
-    """Return a case; its seed draws the data and so the model."""
+    """Return a case; its seed draws the data and so the model.
+
+    Raises:
+        InputError: if the case makes no experiment.
+    """
     taken = options_of(name)
     for option in options:
         if option not in taken:
@@ -39,7 +43,11 @@ def by_name(name: str, /, seed: int = 0, **options: Any) -> Experiment:
 
 
 def options_of(name: str) -> dict[str, Any]:
-    """Return the options of a case with their defaults, ``inspect.Parameter.empty`` if there is none."""
+    """Return the options of a case with their defaults, ``inspect.Parameter.empty`` if there is none.
+
+    Raises:
+        InputError: if the case is no function of a seed.
+    """
     case = REGISTRY.find(name)
     try:
         parameters = list(inspect.signature(case).parameters.values())[1:]  # the first one is the seed

@@ -16,6 +16,7 @@ class CauseSettings:
     """How many causes are tried, and how much of the deviations of M they must explain."""
 
     named: float = 0.98  # share of the squared deviations of M in closed loop that causes must explain, to be the cause
+    partial: float = 0.9  # share that M's parameters must explain for no further cause to be looked for
     little: float = 0.1  # share of the squared deviations that is not worth a sentence
     alike: float = 10.0  # differences of the criterion that do not tell causes apart
     fitted: int = 8  # explanations by one more cause that are fitted to all records

@@ -265,7 +265,7 @@ class _Study:
             offset = self._offset_of_starts()
             return self._reported([] if offset is None else [replace(first, explanation=offset)], [], True)
         parameters = None if self.known else self._of_parameters()
-        if parameters is not None and parameters.counts(self.before) and parameters.complete >= self.settings.named:
+        if parameters is not None and parameters.counts(self.before) and parameters.complete >= self.settings.partial:
             return self._reported([parameters], [], False)
         with stage("fitting causes", (2 * most - 1) * len(self.dictionary), "causes"):
             ranked = self._ranked(())
@@ -288,6 +288,9 @@ class _Study:
                 if 1 - better.complete > 0.5 * (1 - chosen.complete):
                     break
                 chosen, alike = better, others
+        left = 1.0 if chosen is None else 1 - chosen.share
+        if parameters is not None and parameters.counts(self.before) and 1 - parameters.share <= 0.5 * left:
+            chosen, alike = parameters, []
         if chosen is None and first is not None and self.known:
             chosen, alike = first, []
         return self._reported([] if chosen is None else [chosen, *alike], ranked, False)
@@ -310,7 +313,11 @@ class _Study:
         commands, seconds = np.concatenate([run.inputs for run in self.runs]), max(r.times[-1] for r in self.runs)
         late = input_candidates(model, plant.dt, plant.inputs, commands, float(seconds), together=True)
         beside, rng = (*late, *further_attributes(model, self.runs)), np.random.default_rng(0)
-        found = most_probable(model, self.runs, beside, None, rng, ParameterSettings())
+        stage_of = "parameters of M from all of their prior"
+        found = most_probable(
+            model, self.runs, beside, None, rng, ParameterSettings(),
+            lambda steps: self._affords(stage_of, lambda costs: costs.costs.steps(steps)),
+        )  # fmt: skip
         if found is None:
             return None
         deviations = np.sqrt(np.diag(np.linalg.inv(found.precision)))

@@ -21,6 +21,7 @@ from ctxval.campaign.history import executed_trials
 from ctxval.core.plan import gives_inputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
+from ctxval.core.trial_note import TrialNote
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError
 from ctxval.learning import DynamicsStudy
@@ -45,7 +46,7 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class TrialNote:
+class ComparisonNote:
     """What a comparison stores with a trial, before its execution."""
 
     step: int  #: the number of the execution among those of all candidates, from 0; a shared execution has one number
@@ -56,20 +57,20 @@ class TrialNote:
     shared: tuple[str, int] | None = None  #: the candidate and the trial that executed the task; None if this one did
     decided: tuple[Decision, ...] = ()  #: what had been decided about the largest distances
 
-    def to_note(self) -> dict[str, Any]:
-        """Return the note of the trial."""
-        return {"comparison": {name: value for name, value in asdict(self).items() if value is not None}}
+    def to_json(self) -> dict[str, Any]:
+        """Return what the note of the trial has."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
     @staticmethod
-    def of(trial: Trial) -> TrialNote | None:
+    def of(trial: Trial) -> ComparisonNote | None:
         """Return what a comparison stored with a trial; None if it stored nothing."""
         try:
-            return _NOTES.validate_python((trial.note or {}).get("comparison"))
+            return _NOTES.validate_python(trial.note.comparison)
         except ValidationError:
             return None
 
 
-_NOTES = TypeAdapter(TrialNote)
+_NOTES = TypeAdapter(ComparisonNote)
 
 
 @dataclass(eq=False)
@@ -88,9 +89,9 @@ class Candidate:
         self._last: tuple[tuple[int, ...], Prediction | None] | None = None
 
     @property
-    def noted(self) -> list[tuple[Trial, TrialNote]]:
+    def noted(self) -> list[tuple[Trial, ComparisonNote]]:
         """The trials that a comparison has opened, with their notes."""
-        return [(trial, note) for trial in self.recorder.trials if (note := TrialNote.of(trial)) is not None]
+        return [(trial, note) for trial in self.recorder.trials if (note := ComparisonNote.of(trial)) is not None]
 
     @property
     def largest(self) -> float:
@@ -102,10 +103,10 @@ class Candidate:
         copied = {trial.number for trial, note in self.noted if note.shared is not None}
         return [trial for trial in self.recorder.trials if trial.executed and (trial.number in copied) == shared]
 
-    def trajectories(self) -> list[tuple[Trial, TrialNote | None, Trajectory]]:
+    def trajectories(self) -> list[tuple[Trial, ComparisonNote | None, Trajectory]]:
         """Return the completed trials that are its own, with their notes and trajectories; the store keeps these."""
         recorded = executed_trials(self.campaign.store, self.recorder.trials)
-        noted = [(trial, TrialNote.of(trial), trajectory) for trial, trajectory in recorded]
+        noted = [(trial, ComparisonNote.of(trial), trajectory) for trial, trajectory in recorded]
         return [each for each in noted if each[1] is None or each[1].shared is None]
 
     def highest(self, executed: Executed) -> tuple[float, Array] | None:
@@ -190,14 +191,14 @@ class Executions:
         ]
         return [item for _, item in sorted(executed, key=lambda pair: pair[0])]
 
-    def predicted(self, candidate: Candidate, note: TrialNote, point: Array) -> TrialNote:
+    def predicted(self, candidate: Candidate, note: ComparisonNote, point: Array) -> ComparisonNote:
         """Return the note of a draw with what the executions of all other tasks predict for a candidate."""
         prediction = candidate.of_draw(self.history(without=point), point, note.draw or 0, self.most)
-        return TrialNote(note.step, "mean", note.draw, *(prediction or ()))
+        return ComparisonNote(note.step, "mean", note.draw, *(prediction or ()))
 
-    def execute(self, candidate: Candidate, choice: Choice, note: TrialNote, *, predicts: bool) -> None:
+    def execute(self, candidate: Candidate, choice: Choice, note: ComparisonNote, *, predicts: bool) -> None:
         """Execute one task, and record the execution for the others."""
-        stored = {**(choice.note or {}), **self._stored(note)}
+        stored = replace(choice.note, comparison=self._stored(note))
         self._run(candidate, replace(choice, note=stored, planned_draws=0), predicts)
         self._share_all()
 
@@ -209,8 +210,8 @@ class Executions:
                 self._run(candidate, None, False)
         self._share_all()
 
-    def _stored(self, note: TrialNote) -> dict[str, Any]:
-        return replace(note, decided=tuple(self.decided.values())).to_note()
+    def _stored(self, note: ComparisonNote) -> dict[str, Any]:
+        return replace(note, decided=tuple(self.decided.values())).to_json()
 
     def _run(self, candidate: Candidate, choice: Choice | None, predicts: bool) -> None:
         waiting, on_trial = [] if choice is None else [choice], partial(self.on_trial, candidate.name)
@@ -227,7 +228,7 @@ class Executions:
                         self._examined.add(key)
                         self._share(trial, trajectory, replace(note, shared=key[:2]), other)
 
-    def _share(self, trial: Trial, trajectory: Trajectory, note: TrialNote, other: Candidate) -> None:
+    def _share(self, trial: Trial, trajectory: Trajectory, note: ComparisonNote, other: Candidate) -> None:
         known = reversed(other.recorder.trials)
         copy = next((each for each in known if np.array_equal(each.unit_point, trial.unit_point)), None)
         if copy is not None and (copy.state != "open" or copy.attempts):
@@ -242,7 +243,7 @@ class Executions:
             if copy is None:
                 of_draw, parameters = note.question == "mean", trial.parameters
                 made = self.predicted(other, note, trial.unit_point) if of_draw else replace(note, predicted=None)
-                stored = self._stored(replace(made, shared=note.shared))
+                stored = TrialNote(comparison=self._stored(replace(made, shared=note.shared)))
                 choice = Choice(trial.unit_point, trial.origin, planned_draws=0, note=stored, parameters=parameters)
                 with other.recorder.predicting(not of_draw):
                     copy = other.recorder.open(choice).trial

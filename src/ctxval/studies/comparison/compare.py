@@ -65,6 +65,9 @@ def compare(
         stochastic: whether two executions of one task may differ; then only the question ``mean`` can be asked.
         on_trial: called with the name of the candidate and each trial that has ended.
         progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
+
+    Raises:
+        InputError: if the question does not fit a stochastic system or a suite.
     """
     if stochastic and question != "mean":
         raise InputError(

@@ -25,7 +25,7 @@ from ctxval.certificates.bounds import ERRORS
 from ctxval.certificates.difference import MeanDifference, PairedDifferences, mean_difference
 from ctxval.certificates.limits import LIMITS
 from ctxval.core.trial import Trial
-from ctxval.studies.comparison.candidates import Candidate, Decision, Executions, TrialNote
+from ctxval.studies.comparison.candidates import Candidate, ComparisonNote, Decision, Executions
 from ctxval.studies.comparison.result import PairResult
 
 
@@ -141,7 +141,7 @@ class WorstQuestion:
         return new
 
     def _execute(self, candidate: Candidate, choice: Choice, predicted: float | None = None) -> None:
-        note = TrialNote(self.executions.steps, "worst", predicted=predicted)
+        note = ComparisonNote(self.executions.steps, "worst", predicted=predicted)
         predicts = interval_search(candidate.recorder, self.options, self.budget).predicts
         self.executions.execute(candidate, choice, note, predicts=predicts)
 
@@ -161,7 +161,7 @@ class MeanQuestion:
     def __post_init__(self) -> None:
         self.candidates = self.executions.candidates
 
-    def draws_of(self, candidate: Candidate) -> dict[int, tuple[Trial, TrialNote]]:
+    def draws_of(self, candidate: Candidate) -> dict[int, tuple[Trial, ComparisonNote]]:
         """Return the trials of the draws that have ended, by the number of the draw."""
         ended = [(trial, note) for trial, note in candidate.noted if trial.state != "open"]
         return {note.draw: (trial, note) for trial, note in ended if note.draw is not None}
@@ -189,7 +189,7 @@ class MeanQuestion:
         rng = np.random.default_rng([self.seed, draw, 0x6472, *models])
         space = candidate.campaign.validation.space
         point = np.asarray(space.rounded(space.unit_draws(1, rng)[0]))
-        note = self.executions.predicted(candidate, TrialNote(self.executions.steps, "mean", draw), point)
+        note = self.executions.predicted(candidate, ComparisonNote(self.executions.steps, "mean", draw), point)
         self.executions.execute(candidate, Choice(point, "iid"), note, predicts=False)
         return True
 
@@ -220,7 +220,7 @@ class MeanQuestion:
         paired = PairedDifferences(np.array(values), np.array(predicted), self.executions.most)
         return mean_difference(paired, (1 - self.confidence) / (count * (count - 1) / 2))
 
-    def _measured(self, trial: Trial, note: TrialNote) -> tuple[float, float] | None:
+    def _measured(self, trial: Trial, note: ComparisonNote) -> tuple[float, float] | None:
         """Return the distance of a draw, and its prediction minus its mean; None if there is no distance."""
         distance = self.executions.most if trial.state == "failed" else trial.distance
         if distance is None:

@@ -119,6 +119,9 @@ def fit(
             of the others. It may have been learned from the recordings that are held out here.
         hold_out: the share of the recordings that is held out; of a single recording, its last part.
         steps: numbers of steps after which errors are computed.
+
+    Raises:
+        InputError: if no kind is given, or ``parameters`` without a step and bounds.
     """
     if unknown := [str(kind) for kind in kinds if kind not in KINDS]:
         raise UnknownNameError.among("kind of model", unknown[0], KINDS)
@@ -232,6 +235,9 @@ def fit_parameters(
         step: the user's function ``(x, u, theta) -> x_next``.
         bounds: the lower and upper bound of each parameter by name, in the order of theta.
         vectorized: whether ``step`` takes whole batches.
+
+    Raises:
+        InputError: if there are too few records.
     """
     low, high = as_bounds(bounds)
     some = data[:: max(1, -(-len(data) // 4000))]

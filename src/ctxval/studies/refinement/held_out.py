@@ -27,7 +27,11 @@ from ctxval.studies.replay.accuracy import Windows, predicted
 
 @dataclass(frozen=True, eq=False)
 class Records(ShortRepr):
-    """Executions of the system in the order of the rounds, and the data of the first model, which belong to none."""
+    """Executions of the system in the order of the rounds, and the data of the first model, which belong to none.
+
+    Raises:
+        InputError: if there are no records.
+    """
 
     executed: tuple[Trajectory, ...]
     own: Transitions | None = None
@@ -61,6 +65,9 @@ class Records(ShortRepr):
 
         One execution is held out at a time. If there is only one and the model carries no data, its halves are; if
         there is none, halves of the data.
+
+        Raises:
+            InputError: if the only execution has one step.
         """
         count = len(self.executed)
         if count == 0 and self.own is not None:

@@ -172,6 +172,9 @@ def replay(
         steps: numbers of steps after which errors are computed.
         validation: an experiment with this model, whose tasks are then judged too; its system is never executed.
         executions: number of executions of the experiment that are proposed.
+
+    Raises:
+        InputError: if tasks and recordings differ in states or dt.
     """
     positive = Must("positive integers", lambda steps: len(steps) > 0 and min(steps) >= 1)
     require("steps", Annotated[Sequence[int], positive], steps)

@@ -121,7 +121,11 @@ def judged_by(experiment: Experiment, distance: UnsafeMargin) -> Experiment:
 
 
 def require_safe_tasks(validation: Validation) -> float:
-    """Return the share of drawn tasks that M satisfies with the margin; an InputError says that there is none."""
+    """Return the share of drawn tasks that M satisfies with the margin; an InputError says that there is none.
+
+    Raises:
+        InputError: if no drawn task is safe on the model.
+    """
     distance, planner, space = spec_distance(validation), LoopPlanner(validation), validation.space
     plan = validation.plan(0.5 * (space.low + space.high))
     distance.spec.robustness(plan.model_trajectory, plan.task)  # refuses sets of other dimensions
@@ -154,6 +158,9 @@ def assess(
         progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
 
     An InputError is raised if no drawn task satisfies the specification on M.
+
+    Raises:
+        InputError: if no drawn task is safe on the model.
     """
     validation, options = campaign.validation, certificate or CertificateOptions(Dynamics())
     distance, space = spec_distance(validation), validation.space
