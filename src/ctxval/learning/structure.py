@@ -162,8 +162,9 @@ class StructureSearch:
             return before
         study = self.plain.made(given=before.given, with_data=before.with_data)
         if before.of_inputs:
-            study = self.with_inputs(study, executed, before.of_inputs) or study
-        if before.within_steps:
+            with_friction = study.made(effects=before.within_steps)
+            study = self.with_inputs(with_friction, executed, before.of_inputs) or study
+        if before.within_steps and not study.within_steps:
             study = self._with_friction_again(study, executed, before.within_steps)
         return study
 
@@ -202,26 +203,33 @@ class StructureSearch:
         late = study.made(effects=found)
         return self._with_friction_again(late, executed, study.within_steps) if study.within_steps else late
 
-    def _with_friction_again(self, study: DynamicsStudy, executed: Executed, before: Found) -> DynamicsStudy:
-        """Return a study with dry friction as it was found before, with sizes for these executions."""
-        beside = any(isinstance(each.effect, DryFriction) and each.effect.beside for each in before)
-        return self.with_friction(study, executed, beside) or study.made(effects=(*study.effects, *before))
-
     def with_friction(self, study: DynamicsStudy, executed: Executed, beside: bool = False) -> DynamicsStudy | None:
         """Return a study with the dry friction that executions show, which may be hidden beside what M misses."""
+        found = self._friction(study, executed, beside)
+        if found is None:
+            return None
+        study = study.made(effects=(*study.of_inputs, *found))
+        # Effects of inputs that were found without friction have sizes that make up for it.
+        return (self.with_inputs(study, executed, study.of_inputs) if study.of_inputs else None) or study
+
+    def _with_friction_again(self, study: DynamicsStudy, executed: Executed, before: Found) -> DynamicsStudy:
+        """Return a study with dry friction as it was found before, with sizes for these executions."""
+        known = any(isinstance(each.effect, DryFriction) and each.effect.beside for each in before)
+        ways = (self._friction(study, executed, beside) for beside in (known, True))
+        return study.made(effects=(*study.effects, *next(filter(None, ways), before)))
+
+    def _friction(self, study: DynamicsStudy, executed: Executed, beside: bool) -> Found | None:
         extended, model = study.extended.executions(executed), before_refinement(study.validation.model)
         recorded = study.transitions_of(extended, with_data=False) if extended else None
         learned = study.made(effects=study.of_inputs).learned_alone(executed) if beside else None
         if recorded is None or (beside and learned is None):
             return None
-        friction, settings = None, self.settings.dry_friction
         prior = None if learned is None else learned.posterior.prior
         # Least squares may fail, and so may the factor of a covariance.
         with single_threaded(), np.errstate(all="ignore"), contextlib.suppress(RuntimeError, InputError):
-            friction = found_friction(model, recorded[0], settings, prior)
-        if friction is None:
-            return None
-        return study.made(effects=(*study.of_inputs, EffectCandidate(friction)))
+            friction = found_friction(model, recorded[0], self.settings.dry_friction, prior)
+            return None if friction is None else (EffectCandidate(friction),)
+        return None
 
 
 def _without_data(study: DynamicsStudy, executed: Executed) -> DynamicsStudy | None:
