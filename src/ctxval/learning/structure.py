@@ -192,7 +192,9 @@ class StructureSearch:
         plain = [] if estimated else estimated_with(InputEffects())
         # If states have to be estimated each time, or with many inputs, single ones cost too much.
         together = estimated or commanded[0].shape[-1] > self.settings.input_effects.single
-        candidates = study.input_candidates([trajectory for _, trajectory in among], together=together)
+        candidates = before  # what friction leaves in steps that teach imitates others
+        if not (before and study.within_steps):
+            candidates = study.input_candidates([trajectory for _, trajectory in among], together=together)
         with single_threaded(), np.errstate(all="ignore"):
             found = found_effects(
                 study.model, estimated_with if estimated else with_inputs, candidates, before,
@@ -206,11 +208,10 @@ class StructureSearch:
     def with_friction(self, study: DynamicsStudy, executed: Executed, beside: bool = False) -> DynamicsStudy | None:
         """Return a study with the dry friction that executions show, which may be hidden beside what M misses."""
         found = self._friction(study, executed, beside)
-        if found is None:
-            return None
         study = study.made(effects=(*study.of_inputs, *found))
         # Effects of inputs that were found without friction have sizes that make up for it.
-        return (self.with_inputs(study, executed, study.of_inputs) if study.of_inputs else None) or study
+        late = self.with_inputs(study, executed, study.of_inputs) if found and study.of_inputs else None
+        return late or (study if found else None)
 
     def _with_friction_again(self, study: DynamicsStudy, executed: Executed, before: Found) -> DynamicsStudy:
         """Return a study with dry friction as it was found before, with sizes for these executions."""
@@ -218,18 +219,18 @@ class StructureSearch:
         ways = (self._friction(study, executed, beside) for beside in (known, True))
         return study.made(effects=(*study.effects, *next(filter(None, ways), before)))
 
-    def _friction(self, study: DynamicsStudy, executed: Executed, beside: bool) -> Found | None:
+    def _friction(self, study: DynamicsStudy, executed: Executed, beside: bool) -> Found:
         extended, model = study.extended.executions(executed), before_refinement(study.validation.model)
         recorded = study.transitions_of(extended, with_data=False) if extended else None
         learned = study.made(effects=study.of_inputs).learned_alone(executed) if beside else None
         if recorded is None or (beside and learned is None):
-            return None
+            return ()
         prior = None if learned is None else learned.posterior.prior
         # Least squares may fail, and so may the factor of a covariance.
         with single_threaded(), np.errstate(all="ignore"), contextlib.suppress(RuntimeError, InputError):
             friction = found_friction(model, recorded[0], self.settings.dry_friction, prior)
-            return None if friction is None else (EffectCandidate(friction),)
-        return None
+            return () if friction is None else (EffectCandidate(friction),)
+        return ()
 
 
 def _without_data(study: DynamicsStudy, executed: Executed) -> DynamicsStudy | None:
