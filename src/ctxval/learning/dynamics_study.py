@@ -20,6 +20,7 @@ from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.uncertain import uncertain_in
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
+from ctxval.learning.agreement import AgreementSettings
 from ctxval.learning.closed_loops import LoopPlanner, unseen_parameters
 from ctxval.learning.dynamics_posterior import (
     DynamicsPosterior,
@@ -36,7 +37,7 @@ from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import NoiseSettings, NoiseStudy
 from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.parametric_dynamics import ParametricDynamics, ParametricSettings, learned_parameters
-from ctxval.learning.precision import AgreeingDynamics, AgreementSettings, agreeing_posterior
+from ctxval.learning.precision import AgreeingDynamics, agreeing_posterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
 from ctxval.learning.recorded import Memories, data_near, digest, recorded_transitions, scheduled
 from ctxval.learning.regular import RegularSettings, split_transitions
