@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -63,6 +66,50 @@ def test_the_truth_lies_within_the_draws() -> None:
 
 def test_draws_of_one_seed_are_the_same() -> None:
     np.testing.assert_array_equal(_posterior(_executions(0.01), 3), _posterior(_executions(0.01), 3))
+
+
+def _ridge(count: int) -> tuple[models.Parametric, list[Trajectory]]:
+    """A model whose first uncertain parameters act as their product alone, and exact executions."""
+
+    def step(x: np.ndarray, u: np.ndarray, theta: np.ndarray) -> np.ndarray:
+        gain = np.prod(theta[:count], axis=0)
+        rate = x[..., 1] + 0.05 * (gain * u[..., 0] - theta[count] * x[..., 1]) / theta[count + 1]
+        return np.stack([x[..., 0] + 0.05 * rate, rate], axis=-1)
+
+    names = [*(f"gain{k}" for k in range(count)), "drag", "mass"]
+    share: dict[str, float | str] = dict.fromkeys(names, "30 %")
+    model = models.Parametric(step, dict.fromkeys(names, 1.0) | {"drag": 0.2}, uncertain=share, vectorized=True)
+    rng, runs, true = np.random.default_rng(0), [], np.array([*np.linspace(0.8, 1.3, count), 0.3, 1.1])
+    for _ in range(8):
+        states, inputs = [rng.normal(size=2)], 2 * rng.normal(size=(40, 1))
+        for u in inputs:
+            states.append(step(states[-1], u, true))
+        runs.append(Trajectory(0.05 * np.arange(41), np.array(states), inputs))
+    return model, runs
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_parameters_of_which_executions_tell_the_product_alone_stay_uncertain(count: int) -> None:
+    model, runs = _ridge(count)
+    segments = Segments.of(model, runs, np.random.default_rng(0), ParameterSettings())
+    assert segments is not None
+    posterior = ParameterMode.of(model, segments, ParameterSettings()).posterior(np.random.default_rng(1))
+    z = posterior.draw(400, np.random.default_rng(2))
+    # Of parameters with one normal prior, a known product leaves all directions but one.
+    np.testing.assert_allclose(z[:, :count].std(axis=0), np.sqrt(1 - 1 / count), rtol=0.3)
+    assert 1 / (posterior.weights**2).sum() > 29
+    assert posterior.left < 1e-3
+
+
+def test_parameters_that_are_known_very_unequally_have_samples() -> None:
+    model, runs = _ridge(2)
+    segments = Segments.of(model, runs, np.random.default_rng(0), ParameterSettings())
+    assert segments is not None
+    mode = ParameterMode.of(model, segments, ParameterSettings())
+    turned = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
+    precision = turned * [1.0, 1.0, 1e6, 1e10] @ turned.T
+    posterior = replace(mode, precision=precision).posterior(np.random.default_rng(1))
+    assert np.isfinite(posterior.samples).all()
 
 
 def test_without_a_finite_step_there_are_no_segments() -> None:

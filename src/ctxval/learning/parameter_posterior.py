@@ -7,7 +7,8 @@ likelihood that bears contacts and outliers, minus the log posterior is
 .. math:: \tfrac{\nu + 1}{2} \sum_s \log\left(1 + \frac{|e_s(z)|^2}{\nu \sigma^2}\right) + \tfrac12 |z|^2,
 
 where the mean square of all errors of a segment counts as one observation, because they are far from independent. The
-mode is found by Gauss-Newton steps, and draws come from population Monte Carlo (Cappe et al. 2004) around it.
+mode is found by Gauss-Newton steps, and draws come from adaptive multiple importance sampling (Cornuet et al. 2012)
+around it.
 """
 
 from __future__ import annotations
@@ -41,8 +42,10 @@ class ParameterSettings:
     newton: int = 8  # Gauss-Newton steps
     difference: float = 0.02  # of a standardised parameter in a central difference
     longest: float = 2.0  # largest change of a standardised parameter in a step
-    samples: int = 64  # of a round of population Monte Carlo
-    rounds: int = 2
+    samples: int = 64  # of a round of importance sampling
+    rounds: int = 8  # at most
+    effective: float = 30.0  # effective number of samples that suffices
+    curved: float = 1.0  # by which the log posterior may be less at the mean, in whose place the mode is taken
     wider: float = 1.6  # factor of the covariance of the proposal
     proposal_tails: float = 6.0  # degrees of freedom of the proposal
     jitter: float = 0.2  # of draws around samples, in standard deviations
@@ -225,26 +228,41 @@ class ParameterMode(ShortRepr):
         return float(np.minimum(self.here, 10.0).mean() / max(of_model, 1e-300))
 
     def posterior(self, rng: np.random.Generator) -> ParameterPosterior:
-        """Return samples around the mode by population Monte Carlo."""
-        settings, K = self.settings, len(self.z)
-        mean, covariance = self.z, np.asarray(np.linalg.inv(self.precision), dtype=np.float64)
-        samples, weights = self.z[None], np.ones(1)
+        """Return samples around the mode by adaptive multiple importance sampling."""
+        settings, K, nu = self.settings, len(self.z), self.settings.proposal_tails
+        values, vectors = np.linalg.eigh(self.precision)  # an inverse of eigenvalues so unequal is not symmetric
+        mean, covariance = self.z, np.asarray(vectors / values @ vectors.T, dtype=np.float64)
+        samples, heights, proposals = np.empty((0, K)), np.empty(0), list[tuple[Array, Array]]()
         for _ in range(settings.rounds):
-            nu = settings.proposal_tails
             root = np.linalg.cholesky(settings.wider * covariance + 1e-12 * np.eye(K))
-            normal = rng.standard_normal((settings.samples, K))
-            moves = normal / np.sqrt(rng.chisquare(nu, (settings.samples, 1)) / nu)
-            samples = mean + moves @ root.T
-            samples[0], moves[0] = mean, 0.0
-            of_proposal = -0.5 * (nu + K) * np.log1p((moves**2).sum(axis=1) / nu)
-            logs = -self.surprise(self.squares(samples), samples, self.variance) - of_proposal
+            proposals.append((mean, root))
+            scale = np.sqrt(rng.chisquare(nu, (settings.samples, 1)) / nu)
+            new = mean + rng.standard_normal((settings.samples, K)) / scale @ root.T
+            samples = np.concatenate([samples, new])
+            heights = np.concatenate([heights, -self.surprise(self.squares(new), new, self.variance)])
+            # All samples together are from the mixture of all proposals.
+            squares = np.array(
+                [(np.linalg.solve(at, (samples - middle).T) ** 2).sum(axis=0) for middle, at in proposals]
+            )
+            volumes = np.array([np.log(np.diag(at)).sum() for _, at in proposals])
+            of_proposals = -0.5 * (nu + K) * np.log1p(squares / nu) - volumes[:, None]
+            logs = heights - np.logaddexp.reduce(of_proposals, axis=0)
             weights = np.exp(logs - logs.max())
             weights /= weights.sum()
+            effective = 1 / float((weights**2).sum())
             mean = weights @ samples
             spread = samples - mean
-            covariance = (spread * weights[:, None]).T @ spread + 0.1 * covariance
-        at_mean = replace(self, here=self.squares(mean[None])[0])
-        return ParameterPosterior(self.model, mean, covariance, samples, weights, at_mean.left, settings)
+            # Few samples know no covariance of many parameters.
+            covariance = (effective * (spread * weights[:, None]).T @ spread + K * covariance) / (effective + K)
+            if effective >= settings.effective:
+                break
+        middle = np.stack([self.z, mean])
+        of_middle = self.squares(middle)
+        # The mean of a curved posterior lies beside it.
+        at_mode, at_mean = self.surprise(of_middle, middle, self.variance)
+        row = int(at_mean <= at_mode + settings.curved)
+        left = replace(self, here=of_middle[row]).left
+        return ParameterPosterior(self.model, middle[row], covariance, samples, weights, left, settings)
 
 
 class CrossEntropySearch:
