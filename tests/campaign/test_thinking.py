@@ -14,6 +14,7 @@ from ctxval import Campaign, Trial
 from ctxval.campaign.thinking import CampaignThinking
 from ctxval.certificates import CertificateOptions
 from ctxval.errors import CertificateError, InputError
+from ctxval.learning import DynamicsStudy
 from ctxval.learning.stage_costs import Ledger, Speed
 from ctxval.studies.causes import find_causes
 from facts import assert_names, refuses
@@ -143,8 +144,7 @@ def test_what_only_reads_a_store_without_a_speed_is_not_limited(measured: list[S
 
 
 def test_the_default_is_that_of_executions(measured: list[Speed]) -> None:
-    validation = make_validation()
-    thinking = CampaignThinking(validation, False, validation_settings())
+    thinking = CampaignThinking(lambda: DynamicsStudy(make_validation()), False)
     assert thinking.after([]) is None
     with thinking.limited(2.0):
         assert thinking.after([]) is None  # no speed is known yet
@@ -156,12 +156,6 @@ def test_the_default_is_that_of_executions(measured: list[Speed]) -> None:
             assert thinking.after([]) == limit
     with thinking.limited(np.inf):
         assert thinking.after([]) is None
-
-
-def validation_settings():  # type: ignore[no-untyped-def]
-    from ctxval.learning.dynamics_study import LearningSettings
-
-    return LearningSettings().thinking
 
 
 @pytest.mark.parametrize("seconds", [0, -1.0, np.nan, "fast"])

@@ -160,6 +160,16 @@ def test_torques_follow_in_each_step_and_actions_in_some(tmp_path: Path) -> None
         assert u == pytest.approx(np.clip(torques, -4, 4)[[1, 0]])
 
 
+def test_limits_of_actions_are_those_of_controllers(tmp_path: Path) -> None:
+    with refuses(InputError, "limits", "[[low, high], ...]"):
+        Action(limits=[4.0, 2.0])
+    policy = RobotPolicy(
+        contract(tmp_path, action=Action(limits=[[-0.1, 0.2], [0.05, 0.3]])), mjcf=MJCF.format(actuators=SERVOS)
+    )
+    us, _ = recorded(policy, Task(X0, horizon=5, dt=0.02, command=[0.5, 0.3]), states(5))
+    assert ((us[:, [1, 0]] >= [-0.1, 0.05]) & (us[:, [1, 0]] <= [0.2, 0.3])).all()
+
+
 def test_it_keeps_the_contract_of_a_synthesizer(tmp_path: Path) -> None:
     mjcf = MJCF.format(actuators=SERVOS)
     policy = RobotPolicy(contract(tmp_path), mjcf=mjcf)

@@ -137,3 +137,8 @@ def test_small_charts_share_one_legend() -> None:
 @pytest.mark.slow
 def test_a_map_is_a_picture_inside_the_page() -> None:
     assert "data:image/png;base64," in make_chart().image(np.eye(4), 0.0, 1.0).render()
+
+
+def test_commands_in_paragraphs_are_code_and_nothing_else_is_markup() -> None:
+    said = paragraph("say `ctxval run <b>`", element("span", "`a`", title="`b`"))
+    assert str(said) == '<p>say <code>ctxval run &lt;b&gt;</code><span title="`b`">`a`</span></p>'

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctxval import learning
 from ctxval._util.arrays import Array
 from ctxval._util.checked import (
     NonNegativeFloat,
@@ -50,11 +51,12 @@ from ctxval.core.trial import Trial, Trials
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError, CtxvalError, InputError
 from ctxval.gp.surrogate import Surrogate, fit_surrogate
-from ctxval.learning.sensitivity import Sensitivity
 from ctxval.searches import Auto, Search
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+    from ctxval.learning import Sensitivity
 
 __all__ = ["Campaign", "OpenTrial"]
 
@@ -156,7 +158,8 @@ class Campaign:
     @property
     def sensitivity(self) -> Sensitivity | None:
         """How far small changes move closed loops of M if these are not smooth, as found before the first execution."""
-        return next((Sensitivity.from_json(trial.note.sensitivity) for trial in self.trials[:1]), None)
+        found = next((trial.note.sensitivity for trial in self.trials[:1]), None)
+        return None if found is None else learning.Sensitivity.from_json(found)
 
     def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
         """Return the trajectories of the model and of the system in a trial; None if a trajectory is not stored.

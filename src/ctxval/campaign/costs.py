@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ctxval import learning
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval.certificates.dynamics import draws_for
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
-from ctxval.learning import DynamicsStudy
 from ctxval.searches import Auto, Costs, Prediction
 
 
@@ -48,12 +48,12 @@ class ThinkingCosts:
             nominal = validation.plan(point).model_trajectory
             away = 0.1 * np.ptp(nominal.states, axis=0) * np.sin(np.linspace(0, 3, nominal.horizon + 1))[:, None]
             made_up.append((validation.space.to_unit(point), replace(nominal, states=nominal.states + away)))
-        begun, study = _now(), DynamicsStudy(validation)
+        begun, study = _now(), learning.DynamicsStudy(validation)
         learned = study.learn(made_up)
         prediction = study.prediction_of(learned, made_up)
         if prediction is None:
             return cls(design, loop)
-        learning = _now() - begun
+        to_learn = _now() - begun
         costs = costs_of(prediction, validation, ())
         choice = verdict = None
         if learned is not None:
@@ -63,14 +63,14 @@ class ThinkingCosts:
                 begun = _now()
                 learned.screened  # noqa: B018 (what is computed first takes long)
                 each = (_now() - begun) / loops
-            choice = learning + max(designing, loops * each)
+            choice = to_learn + max(designing, loops * each)
             verdict = choice + study.search.expected_loops(draws_for(CONFIDENCE)) * each
         search = Auto("thorough")
         search.reset(validation.space.dimension, 0)
         designs = search.designs(prediction)
         fewest = round(search.settings.shares[-1] * designs)
         thorough, fast = (search.thinking_seconds(costs, number) for number in (designs, fewest))
-        return cls(design, loop, choice, verdict, learning + thorough, designs, learning + fast)
+        return cls(design, loop, choice, verdict, to_learn + thorough, designs, to_learn + fast)
 
 
 def costs_of(prediction: Prediction, validation: Validation, trials: Sequence[Trial]) -> Costs:

@@ -8,10 +8,11 @@ import json
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctxval import learning
 from ctxval._util.arrays import Array
 from ctxval._util.latest import Latest
 from ctxval._util.progress import stage
@@ -27,30 +28,36 @@ from ctxval.certificates.limits import LIMITS
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.predictions import CheckedPrediction
 from ctxval.certificates.sample import Sample
-from ctxval.core.target import Target
+from ctxval.core.target import LARGEST_DISTANCE, Target
 from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.trial import REDEFINED, Trial, Trials
 from ctxval.core.trial_note import TrialNote
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError
-from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
-from ctxval.learning.coverage import beyond_range, unsampled_corner
-from ctxval.learning.prediction import Executed
-from ctxval.learning.sensitivity import Sensitivity, found_sensitivity
-from ctxval.learning.stage_costs import Costs, Ledger, Sizes, Thinking
-from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
 
-NEAR = 0.02  #: a task that differs from an executed one by less than this in every coordinate is no new one
+if TYPE_CHECKING:
+    from ctxval.learning import (
+        DynamicsStudy,
+        Executed,
+        ExecutionPrediction,
+        LearnedDynamics,
+        Ledger,
+        Sensitivity,
+        Thinking,
+        WorstCase,
+    )
 
-_Known = Latest[tuple[object, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None, Ledger]]
+    _Known = tuple[Sequence[Trajectory], LearnedDynamics | None, str | None, Ledger]
+
+NEAR = 0.02  #: a task that differs from an executed one by less than this in every coordinate is no new one
 
 
 def prediction_in(note: TrialNote) -> ExecutionPrediction | None:
     """Return the prediction of an execution in the note of its trial, of whichever distance; None if there is none."""
-    return None if note.prediction is None else ExecutionPrediction.from_json(note.prediction)
+    return None if note.prediction is None else learning.ExecutionPrediction.from_json(note.prediction)
 
 
 class SensitivityWarning(UserWarning):
@@ -78,12 +85,23 @@ class CampaignDynamics:
         self.failure: str | None = None
         self.sensitivity: Sensitivity | None = None  #: of M, if its closed loops are not smooth
         self.shortage: TimeShortage | None = None  #: why the last verdict has no evidence; None if it has some
-        self._use(DynamicsStudy(validation, seed))
+        self._validation, self._seed = validation, seed
+        self._target: Target = LARGEST_DISTANCE
+        self._study: DynamicsStudy | None = None
+        self._use(None)
         manual = bool(getattr(validation.system, "manual", False))
-        self.thinking = CampaignThinking(self.study.validation, manual, self.study.settings.thinking)
+        self.thinking = CampaignThinking(lambda: self.study, manual)
 
-    def _use(self, study: DynamicsStudy) -> None:
-        self.study, self._learned = study, _Known(LIMITS.predictions + 3)
+    @property
+    def study(self) -> DynamicsStudy:
+        """What learns; a finished campaign, whose evidence is stored, needs none."""
+        if self._study is None:
+            self._study = learning.DynamicsStudy(self._validation, self._seed, self._target)
+        return self._study
+
+    def _use(self, study: DynamicsStudy | None) -> None:
+        self._study = study
+        self._learned: Latest[tuple[object, ...], _Known] = Latest(LIMITS.predictions + 3)
         self._of_suite: Array | None = None  # the ends of the run of M on each task of a suite, (N, 2, n + m)
         self._parts: tuple[str, bytes] | None = None  # of the study, when it learned first
         # Predictions that no store has, by their trials: each verdict checks those of the last trials.
@@ -91,8 +109,9 @@ class CampaignDynamics:
 
     def ask_of(self, target: Target) -> None:
         """State what is asked for, before it is known whether the system is noisy."""
-        if target != self.study.target:
-            self._use(self.study.fresh_copy(target))
+        if target != self._target:
+            self._target = target
+            self._use(None if self._study is None else self._study.fresh_copy(target))
 
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
         """Return what the completed trials, and unless ``alone`` other recordings teach; None if it is nothing."""
@@ -138,7 +157,7 @@ class CampaignDynamics:
     def noted(self, trials: Sequence[Trial]) -> dict[str, Any]:
         """Return fields of the note of the next trial: the thinking on its task, if it is limited, and sensitivity."""
         sensitivity = None if trials or self.sensitivity is None else self.sensitivity.to_json()
-        thinking = self.thinking.noted(trials, self.ledger(trials) if trials else Ledger())
+        thinking = self.thinking.noted(trials, self.ledger(trials) if trials else learning.Ledger())
         return {"thinking": thinking, "sensitivity": sensitivity}
 
     def find_sensitivity(self, threshold: float | None) -> None:
@@ -150,7 +169,7 @@ class CampaignDynamics:
         thinking = self.thinking.after(())
         if thinking is not None:
             with contextlib.suppress(Exception):  # users' parts
-                self.sensitivity = found_sensitivity(self.study.planner, thinking, threshold)
+                self.sensitivity = learning.found_sensitivity(self.study.planner, thinking, threshold)
         if self.sensitivity is not None:
             units = self.study.given.labels.units
             warnings.warn(self.sensitivity.in_words(units), SensitivityWarning, stacklevel=2)
@@ -158,7 +177,7 @@ class CampaignDynamics:
     def _allowed(self, trials: Sequence[Trial]) -> float:
         """Return the distance that is negligible beside all stated thresholds; 0 if executed ones are larger."""
         least = min((stated.threshold for stated in self._store.thresholds() or ()), default=0.0)
-        allowed = self.study.settings.agreement.share * least
+        allowed = learning.AgreementSettings().share * least
         return allowed if Trials(trials).largest <= allowed else 0.0
 
     def regular(self, trials: Sequence[Trial]) -> LearnedDynamics | None:
@@ -281,9 +300,11 @@ class CampaignDynamics:
         with self.limited(thinking, trials), self.thinking.deciding():
             budget = self.thinking.after(trials)
         if budget is None:
-            return Ledger()
+            return learning.Ledger()
         known = Trials(trials).executions
-        return Ledger(Costs(budget, Sizes.of(budget.speed, self.study.validation.space.dimension, known, 0)))
+        return learning.Ledger(
+            learning.Costs(budget, learning.Sizes.of(budget.speed, self.study.validation.space.dimension, known, 0))
+        )
 
     @contextlib.contextmanager
     def deciding(self, trials: Sequence[Trial]) -> Iterator[tuple[LearnedDynamics | None, Ledger, Thinking | None]]:
@@ -309,8 +330,8 @@ class CampaignDynamics:
     def _key(self, trials: Sequence[Trial], confidence: float) -> str:
         of_trials = ((trial.number, trial.state, trial.distance, trial.note.to_json()) for trial in trials)
         text = json.dumps([self._allowed(trials), *of_trials])
-        physical = "".join(f"{name} " for name in self.study.given.physical)
-        return f"evidence {confidence} {self.study.target} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
+        physical = "".join(f"{name} " for name in self._validation.physical)
+        return f"evidence {confidence} {self._target} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
     def _whole(self, learned: LearnedDynamics, trials: Sequence[Trial], confidence: float, ledger: Ledger) -> Evidence:
         draws, drawn_from = draws_for(confidence), learned.drawn_from
@@ -339,7 +360,9 @@ class CampaignDynamics:
         jump, further = learned.study.search.largest_jump(drawn_from), dict[str, Any]()
         further |= {"jump": jump, "unvisited_region": learned.unvisited_region}
         # The maxima of a distance with kinks lie on ridges, which deeper searches climb higher.
-        if is_kinked(learned.study.given.distance) or (evidence.low_dimensional and replace(evidence, jump=jump).jumps):
+        if learning.is_kinked(learned.study.given.distance) or (
+            evidence.low_dimensional and replace(evidence, jump=jump).jumps
+        ):
             if not ledger.fits("loops", lambda costs: costs.intensified(learned.search.settings)):
                 ledger.missing = ledger.seconds("loops", lambda costs: costs.intensified(learned.search.settings))
                 return replace(evidence, **further)
@@ -396,7 +419,9 @@ class CampaignDynamics:
             predictions=tuple(predictions),
             coverage=learned.coverage,
             unsampled_parameter=learned.unsampled_parameter,
-            unsampled_corner=unsampled_corner(learned.executed, self.study.validation.space, learned.coverage.task),
+            unsampled_corner=learning.unsampled_corner(
+                learned.executed, self.study.validation.space, learned.coverage.task
+            ),
             # Loops on M with other parameters are cheap enough to search more of them.
             low_dimensional=self.study.planner.batched
             and (worst.points.shape[1] <= LIMITS.low_dimensional or bool(learned.values)),
@@ -464,7 +489,7 @@ class CampaignDynamics:
 
     def learned_for(self, trials: Sequence[Trial], options: CertificateOptions) -> Learned:
         """Return what a certificate of all trials reads of the learned dynamics."""
-        kind, space = options.kind, self.study.validation.space
+        kind, space = options.kind, self._validation.space
         with contextlib.suppress(CertificateError):  # the certificate refuses the trials itself
             sample = replace(Sample.of(trials), suite=space.members)
             if kind.needs_evidence(sample):
@@ -497,7 +522,7 @@ class CampaignDynamics:
                         of_suite[row] = _ends(planned.nominal.states, planned.nominal.inputs)
             self._of_suite = of_suite
         recorded = np.concatenate(records)
-        beyond = beyond_range(recorded, self._of_suite) / np.maximum(np.ptp(recorded, axis=0), 1e-9)
+        beyond = learning.beyond_range(recorded, self._of_suite) / np.maximum(np.ptp(recorded, axis=0), 1e-9)
         return SuiteRuns(features, np.where(np.isfinite(beyond), beyond, np.inf).max(axis=(1, 2)))
 
     def stored_prediction(self, trial: Trial) -> ExecutionPrediction | None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctxval import learning
 from ctxval._util.arrays import Array
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import reason_of
@@ -40,8 +41,9 @@ from ctxval.core.target import LARGEST_DISTANCE
 from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trial import Trial, Trials
 from ctxval.errors import InputError
-from ctxval.learning import LearnedDynamics
-from ctxval.learning.stage_costs import Costs, Ledger, Thinking
+
+if TYPE_CHECKING:
+    from ctxval.learning import Costs, LearnedDynamics, Ledger, Thinking
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ class EnvelopeSearch:
         self._interval, self._recorder = interval, interval.recorder
         self._threshold, self._confidence = interval.limit, interval.options.confidence
         self._split: tuple[tuple[int, ...], LearnedDynamics | None] | None = None
-        self._ledger = Ledger()  # of the present choice or envelope; learning was taken from it before
+        self._ledger = learning.Ledger()  # of the present choice or envelope; learning was taken from it before
 
     def envelope(self) -> Envelope:
         """Return the envelope that the executions give, or why there is none. The system is never executed."""
@@ -133,7 +135,7 @@ class EnvelopeSearch:
     def _begin(self, ledger: Ledger, budget: Thinking | None) -> None:
         """Begin a choice or an envelope with a budget, from which what was learned is taken."""
         costs = ledger.costs
-        self._ledger = Ledger(None if costs is None or budget is None else replace(costs, thinking=budget))
+        self._ledger = learning.Ledger(None if costs is None or budget is None else replace(costs, thinking=budget))
         for kind, seconds in ledger.expected.items():
             if kind != "loops":
                 self._ledger.add(kind, seconds)

@@ -11,10 +11,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctxval import learning
 from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
@@ -41,9 +42,9 @@ from ctxval.core.target import Target
 from ctxval.core.trial import Trial, Trials
 from ctxval.core.trial_note import NO_NOTE, TrialNote
 from ctxval.errors import CertificateError, InputError
-from ctxval.learning.learned_dynamics import LearnedDynamics
-from ctxval.learning.share_search import ShareSearch
-from ctxval.learning.worst_case import is_kinked
+
+if TYPE_CHECKING:
+    from ctxval.learning import LearnedDynamics
 
 
 @dataclass(frozen=True)
@@ -290,7 +291,7 @@ class IntervalSearch:
         """Return one of new random tasks whose predicted distance exceeds a threshold, for a bet; None without one."""
         recorder, trials = self.recorder, self.recorder.trials
         learned = recorder.dynamics.learned(trials)
-        if learned is None or not isinstance(learned.search, ShareSearch):
+        if learned is None or not isinstance(learned.search, learning.ShareSearch):
             return None
         tasks = recorder.draws.many(trials, round(SEARCH.above / (1 - self._target.share)))
         rows = np.flatnonzero(learned.expected(tasks) > threshold)
@@ -375,7 +376,7 @@ class IntervalSearch:
     def _near(self) -> float:
         """The largest change of each coordinate to a task that is no new one."""
         # A distance with kinks may be large in a few tasks only, which are next to others where it is 0.
-        kinked = is_kinked(self.recorder.validation.distance)
+        kinked = learning.is_kinked(self.recorder.validation.distance)
         return self.recorder.validation.space.near(0.1 * NEAR if kinked else NEAR)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,8 +32,10 @@ from ctxval.core.trial import Trial, Trials
 from ctxval.core.trial_note import RESERVED, TrialNote
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
-from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.searches import BaseSearch, SequentialSearch
+
+if TYPE_CHECKING:
+    from ctxval.learning import LoopPlanner
 
 Note = dict[str, Any] | None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.interval_search import SEARCH, IntervalSearch, is_decisive
@@ -19,7 +19,9 @@ from ctxval.certificates.options import WITHIN
 from ctxval.certificates.prediction_tests import TESTS
 from ctxval.certificates.remaining import RemainingTasks
 from ctxval.errors import CertificateError
-from ctxval.learning.learned_dynamics import LearnedDynamics
+
+if TYPE_CHECKING:
+    from ctxval.learning import LearnedDynamics
 
 
 class SuiteIntervalSearch(IntervalSearch):

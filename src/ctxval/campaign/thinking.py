@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from ctxval import learning
 from ctxval.core.trajectory import Transitions
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
-from ctxval.learning.stage_costs import Costs, Ledger, Sizes, Speed, Thinking, ThinkingSettings, reduced, speed_to_json
-from ctxval.learning.worst_case import WorstCaseSettings
+
+if TYPE_CHECKING:
+    from ctxval.learning import DynamicsStudy, Ledger, Speed, Thinking, ThinkingSettings, WorstCaseSettings
 
 
 @dataclass(frozen=True)
@@ -49,16 +51,23 @@ class CampaignThinking:
     """The budgets of the choices of one campaign; there is none outside of :meth:`limited`.
 
     Args:
-        validation: the one of which dynamics are learned.
+        study: returns what learns the dynamics.
         manual: whether people execute the tasks.
-        settings: how budgets are shared.
     """
 
-    def __init__(self, validation: Validation, manual: bool, settings: ThinkingSettings) -> None:
-        self._validation, self._manual, self._settings = validation, manual, settings
+    def __init__(self, study: Callable[[], DynamicsStudy], manual: bool) -> None:
+        self._study, self._manual = study, manual
         self._limited, self._decides = False, False
         self._stated: float | None = None
         self._speed: Speed | None = None
+
+    @property
+    def _validation(self) -> Validation:
+        return self._study().validation
+
+    @property
+    def _settings(self) -> ThinkingSettings:
+        return self._study().settings.thinking
 
     @contextmanager
     def limited(self, stated: float | None) -> Iterator[None]:
@@ -87,13 +96,13 @@ class CampaignThinking:
         timed = [trial.seconds for trial in trials if trial.executed and trial.seconds is not None]
         execution = np.inf if self._manual else statistics.median(timed) if timed else None
         known = [trial.note.thinking for trial in trials if trial.state != "open" and trial.note.thinking is not None]
-        thinking = Thinking.after(known, self._stated, execution, speed, self._settings)
+        thinking = learning.Thinking.after(known, self._stated, execution, speed, self._settings)
         return replace(thinking, seconds=thinking.decisive) if self._decides else thinking
 
     def _known(self, trials: Sequence[Trial]) -> Speed | None:
         """Return the speed that a trial stores, or that was measured; None if it is not known."""
         noted = (trial.note.thinking for trial in trials if trial.note.thinking is not None)
-        stored = (Speed.from_json(each.get("speed")) for each in noted)
+        stored = (learning.Speed.from_json(each.get("speed")) for each in noted)
         return next((speed for speed in stored if speed is not None), self._speed)
 
     def measure(self, trials: Sequence[Trial]) -> None:
@@ -101,36 +110,36 @@ class CampaignThinking:
         if self._limited and self._known(trials) is None:
             space = self._validation.space
             points = np.random.default_rng(0).random((16, space.dimension))
-            measured = Speed.measured(self._validation, space.candidates(points)[:16], self._settings)
-            self._speed = None if measured is None else Speed.from_json(speed_to_json(measured))
+            measured = learning.Speed.measured(self._validation, space.candidates(points)[:16], self._settings)
+            self._speed = None if measured is None else learning.Speed.from_json(learning.speed_to_json(measured))
 
     @property
     def search_settings(self) -> WorstCaseSettings:
         """The sizes of a search of all tasks."""
         space, batched = self._validation.space, bool(getattr(self._validation.synthesizer, "batched", False))
-        return WorstCaseSettings.for_space(space, batched)
+        return learning.WorstCaseSettings.for_space(space, batched)
 
     def ledger(self, trials: Sequence[Trial], executions: int) -> Ledger:
         """Return the ledger of the next choice, which is ``spent`` if nothing can be learned within its budget."""
         thinking = self.after(trials)
         if thinking is None:
-            return Ledger()
+            return learning.Ledger()
         space, settings = self._validation.space, self.search_settings
-        smallest = reduced(settings, thinking.settings.shares[-1])
+        smallest = learning.reduced(settings, thinking.settings.shares[-1])
         data = getattr(self._validation.model, "data", None)
         known = min(len(data), 600) if isinstance(data, Transitions) else 0
-        sizes = Sizes.of(thinking.speed, space.dimension, executions, known)
-        ledger, few = Ledger(Costs(thinking, sizes)), thinking.settings.few_draws
+        sizes = learning.Sizes.of(thinking.speed, space.dimension, executions, known)
+        ledger, few = learning.Ledger(learning.Costs(thinking, sizes)), thinking.settings.few_draws
         ledger.reserve = ledger.seconds("loops", lambda costs: costs.prediction(few) + costs.next_task())
-        learning = ledger.seconds("learning", lambda costs: costs.learning())
+        to_learn = ledger.seconds("learning", lambda costs: costs.learning())
         ledger.owed = ledger.seconds("loops", lambda costs: costs.search(smallest, whole=False) + costs.plan(4))
-        if ledger.reserve + ledger.owed + learning > thinking.seconds:
+        if ledger.reserve + ledger.owed + to_learn > thinking.seconds:
             ledger.spent_up = True
-            ledger.incomplete = learning + ledger.seconds("loops", lambda costs: costs.search(settings))
+            ledger.incomplete = to_learn + ledger.seconds("loops", lambda costs: costs.search(settings))
             ledger.replaced.append("learned dynamics, by the distances alone")
         return ledger
 
     def noted(self, trials: Sequence[Trial], ledger: Ledger) -> dict[str, Any] | None:
         """Return what the next trial stores of the choice of its task; None without a budget."""
         speed = self._known(trials) if self._limited else None
-        return None if speed is None else {"speed": speed_to_json(speed), **ledger.to_json()}
+        return None if speed is None else {"speed": learning.speed_to_json(speed), **ledger.to_json()}

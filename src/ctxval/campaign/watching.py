@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ctxval import learning
 from ctxval._util.checked import require
 from ctxval._util.progress import advance, stage
 from ctxval.campaign.choices import Execution
@@ -16,7 +17,6 @@ from ctxval.certificates.expiry import EXCEEDED, FEWEST, WatchedChannel, WatchSt
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
-from ctxval.learning.run_statistics import DISTANCE, RunStatistics, names
 
 FALSE_ALARMS = 1e-3  #: usual rate of false alarms: one in 1,000 executions
 _MOST = 24  # certified executions that are predicted from the others, the latest ones: each is learned from anew
@@ -54,14 +54,14 @@ class Watch:
         latest = range(max(0, len(executed) - _MOST), len(executed))
         certified = []
         with stage("predicting the certified runs", len(latest), "runs"):
-            self._statistics = RunStatistics.of(learned, threshold)
+            self._statistics = learning.run_statistics.RunStatistics.of(learned, threshold)
             for k in latest:
                 certified.append(self._statistics.certified(k, self._trials[k].distance or 0.0))
                 advance(1)
         known = [each for each in certified if each]
         if len(known) < FEWEST:
             raise CertificateError("the executions in the store cannot be predicted from each other.")
-        self._states = list(names(learned.study, len(learned.posterior.data.sizes)))
+        self._states = list(learning.run_statistics.names(learned.study, len(learned.posterior.data.sizes)))
         named = {name: [each[name] for each in known if name in each] for name in max(known, key=len)}
         channels = []
         for name, runs in named.items():
@@ -138,7 +138,7 @@ class Watch:
             return []
         distances = np.array([trial.distance or 0.0 for trial in self._trials])
         cause = self.state.cause
-        if cause not in (DISTANCE, EXCEEDED):
+        if cause not in (learning.run_statistics.DISTANCE, EXCEEDED):
             channel = next(each for each in self.state.channels if each.name == cause)
             kinds = [(f"{each} residuals", f"systematic {each} residuals") for each in self._states]
             state = next(i for i, each in enumerate(kinds) if cause in each)

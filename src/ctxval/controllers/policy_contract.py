@@ -16,6 +16,7 @@ from ctxval._util.files import read_toml, write_text
 from ctxval._util.registry import construct
 from ctxval._util.representation import ShortRepr
 from ctxval._util.toml import toml_text
+from ctxval.core.controller import Limits, LimitsLike
 from ctxval.core.floating_base import Fall, FloatingBase
 from ctxval.errors import InputError, ShapeError
 
@@ -100,7 +101,7 @@ class Action(ShortRepr):
     inputs are ``scale a``.
 
     Raises:
-        InputError: if torques have no gains.
+        InputError: if torques have no gains, or if the limits have another form.
     """
 
     target: Literal["position", "torque", "direct"] = "position"
@@ -108,9 +109,12 @@ class Action(ShortRepr):
     clip: Numbers | None = None  #: largest magnitude of the outputs, or their limits [low, high], before all else
     kp: Numbers = 0.0  #: gains of the torques, N m/rad
     kd: Numbers = 0.0  #: N m s/rad
-    limits: Numbers | None = None  #: largest magnitude of each input; None if there is none
+    #: limits of the inputs, rows ``[low, high]`` for each, or one number h for ``[-h, h]`` of all
+    limits: LimitsLike | None = None
 
     def __post_init__(self) -> None:
+        if self.limits is not None:
+            Limits.of(self.limits)  # refuses other forms
         _make_tuples(self)
         if self.target == "torque" and not np.any(np.asarray(self.kp) > 0):
             raise InputError("torques need the gains kp and kd.")

@@ -16,6 +16,7 @@ from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.controllers.policy_contract import PolicyContract, Term, clipped
 from ctxval.controllers.policy_networks import read_network
+from ctxval.core.controller import Limits
 from ctxval.core.floating_base import FloatingBase
 from ctxval.core.model import Model
 from ctxval.core.task import Task
@@ -281,7 +282,7 @@ class PolicyController(ShortRepr):
             gap, rates = u - x[..., layout.positions], x[..., layout.rates]
             u = np.asarray(meaning.kp) * gap - np.asarray(meaning.kd) * rates
         if meaning.limits is not None:
-            u = np.clip(u, -np.asarray(meaning.limits), np.asarray(meaning.limits))
+            u = Limits.of(meaning.limits).clip(u)
         return u if meaning.target == "direct" else u[..., layout.inputs]
 
 

@@ -15,9 +15,9 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model, Step, advanced, memory_in, run_of
-from ctxval.learning.dry_friction import DryFriction
 from ctxval.learning.kernel_expansion import KernelExpansion
 from ctxval.learning.residual_data import ResidualData
+from ctxval.learning.settling import SettlingModel
 
 
 class Draws(ShortRepr, ABC):
@@ -125,7 +125,7 @@ class DynamicsDraws(DrawsWithoutNoise):
     def _some(self, rows: Rows) -> Self:
         chosen = [rows[(rows >= first) & (rows < last)] - first for first, last in pairwise(self._firsts)]
         kept = tuple(each[some] for each, some in zip(self.expansions, chosen, strict=True) if len(some))
-        model = self.model[rows] if isinstance(self.model, DryFriction) else self.model
+        model = self.model[rows] if isinstance(self.model, SettlingModel) else self.model
         return replace(self, expansions=kept, model=model)
 
     def step(self, x: Array, u: Array) -> Array:
@@ -145,7 +145,7 @@ class DynamicsDraws(DrawsWithoutNoise):
         shape = x.shape
         x, acting = map(self._of_draws, (x, u))
         with np.errstate(all="ignore"):
-            if isinstance(self.model, DryFriction):
+            if isinstance(self.model, SettlingModel):
                 following = self.model.following(x, acting, lambda inputs: self.residuals(x, inputs))
             elif memory is None:
                 following = self.data.geometry.corrected(self.model.step(x, acting), self.residuals(x, acting), x)

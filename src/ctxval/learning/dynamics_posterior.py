@@ -17,15 +17,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval._util.arrays import Array, ArrayLike, Rows, single_threaded
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.state_geometry import PLAIN, StateGeometry
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
-from ctxval.gp.cholesky import factorise, pivoted_rows
+from ctxval.gp.cholesky import CholeskyFactor, factorise, pivoted_rows
 from ctxval.learning.draws import DisturbedDynamics, DynamicsDraws, bounded
-from ctxval.learning.dry_friction import DryFriction, Pushes
 from ctxval.learning.hyperparameters import (
     FAMILIES,
     SMOOTHER_FAMILIES,
@@ -34,6 +33,7 @@ from ctxval.learning.hyperparameters import (
 )
 from ctxval.learning.kernel_expansion import Component, KernelExpansion, draw_functions, joined
 from ctxval.learning.residual_data import ResidualData, residual_data, smoother_than, with_what_varies
+from ctxval.learning.settling import SettlingModel
 
 
 @dataclass(frozen=True)
@@ -195,35 +195,22 @@ class DynamicsPosterior(ShortRepr):
         return np.asarray(5.0 * np.abs(self.data.outputs).max(axis=0))
 
     def _limited(self, mean: KernelExpansion) -> DynamicsDraws:
-        least = np.zeros(len(mean.weights))  # nothing shows that friction at rest is larger
+        least = np.zeros(len(mean.weights))  # nothing shows that what is open is larger
         return DynamicsDraws(self.model_with(least), self.data, (mean,), limit=self.limit[self.data.learned])
 
     @functools.cached_property
-    def resting(self) -> tuple[Array, Array, Array, Array] | None:
-        """The numbers of :meth:`DryFriction.resting`; None without dry friction."""
-        model, pushes = self.covariances.model, self.pushes
-        return model.resting(self.data.executions, pushes) if isinstance(model, DryFriction) and pushes else None
-
-    @functools.cached_property
-    def pushes(self) -> Pushes | None:
-        """What acted on joints in the executions; None without dry friction."""
-        return self.pushes_in(self.data.executions) if isinstance(self.covariances.model, DryFriction) else None
-
-    def pushes_in(self, steps: Transitions, errors: Array | None = None) -> Pushes:
-        """Return what acts on joints in steps of the system or of the mean; see :meth:`DryFriction.pushes`."""
+    def model(self) -> Model:
+        """The model to which residuals are added, with the bounds of what executions leave open in it."""
         model = self.covariances.model
-        assert isinstance(model, DryFriction)
+        if not isinstance(model, SettlingModel):
+            return model
         mean = DynamicsDraws(model, self.data, (self.most_probable.mean,), limit=self.limit[self.data.learned])
         with single_threaded(), np.errstate(all="ignore"):
-            return model.pushes(steps, lambda acting: mean.residuals(steps.x[None], acting[None])[0], errors)
+            return model.told_by(self.data.executions, lambda x, acting: mean.residuals(x[None], acting[None])[0])
 
-    def model_with(self, shares: Array) -> Model:
-        """Return the model of draws ``(S,)`` whose friction at rest is a share of the way to the largest one."""
-        model = self.with_most_friction
-        if not isinstance(model, DryFriction) or self.resting is None:
-            return model
-        least, largest, *_ = self.resting
-        return replace(model, rest=(least + shares[:, None, None] * (largest - least))[:, None])
+    def model_with(self, shares: ArrayLike) -> Model:
+        """Return the model of draws ``(S,)`` in which what is open is a share of the way to the largest it may be."""
+        return self.model.between(shares) if isinstance(self.model, SettlingModel) else self.model
 
     def unfamiliarity(self, states: Array, inputs: Array) -> Array:
         """Return the standard deviation of r along states and inputs ``(q, H, m)``, as a share of a typical step."""
@@ -234,13 +221,10 @@ class DynamicsPosterior(ShortRepr):
         sizes = (data.sizes / data.steps)[data.learned] ** 2 * most.squares / len(most.centres)
         return np.asarray(np.sqrt(variance * (sizes.mean() if len(sizes) else 0.0)))
 
-    @property
-    def with_most_friction(self) -> Model:
-        """The model to which residuals are added, with the largest dry friction at rest."""
-        model = self.covariances.model
-        if not isinstance(model, DryFriction) or self.resting is None:
-            return model
-        return replace(model, rest=self.resting[1], passed=self.resting[2])
+    def prior(self, x: Array, u: Array) -> CholeskyFactor:
+        """Return the factor of the prior covariance ``(N, N)``, with noise, at states and acting inputs."""
+        most, Z = self.most_probable.hyperparameters, self.data.standardised(x, u)
+        return factorise(most.kernel(most.theta, Z, Z), most.noise, insist=True)
 
     # Draws
 
@@ -268,7 +252,7 @@ class DynamicsPosterior(ShortRepr):
             drawn = [draw_functions(group, relevant, count, settings.pivots, rng) for group in groups]
         expansions, left_out = zip(*drawn, strict=True)
         draws = DynamicsDraws(self.covariances.model, self.data, joined(expansions), max(left_out))
-        if self.resting is not None:  # nothing is known of the friction at rest between its bounds
+        if isinstance(self.model, SettlingModel):  # nothing is known of what is open between its bounds
             shares = (rng.permutation(len(draws)) + rng.random(len(draws))) / len(draws)
             draws = replace(draws, model=self.model_with(shares))
         return draws
@@ -315,7 +299,7 @@ def learn_covariances(
         return None
     with single_threaded():
         data = with_what_varies(data, model, transitions, sources, settings.learned_from, settings.varies)
-        if settings.of_steps and not isinstance(model, DryFriction):
+        if settings.of_steps and not isinstance(model, SettlingModel):
             with contextlib.suppress(InputError, np.linalg.LinAlgError):  # numbers too large for a linear model
                 smoother = smoother_than(data, settings.learned_from)
         if smoother is not None:

@@ -14,13 +14,14 @@ from ctxval._util.describe import describe
 from ctxval._util.latest import Latest
 from ctxval._util.representation import ShortRepr
 from ctxval.core.distance import ComposedDistance
+from ctxval.core.model import Model
 from ctxval.core.target import LARGEST_DISTANCE, Target
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.uncertain import uncertain_in
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
+from ctxval.learning.agreement import AgreementSettings
 from ctxval.learning.closed_loops import LoopPlanner, unseen_parameters
-from ctxval.learning.dry_friction import DryFriction
 from ctxval.learning.dynamics_posterior import (
     DynamicsPosterior,
     LearnedCovariances,
@@ -28,7 +29,7 @@ from ctxval.learning.dynamics_posterior import (
     condition,
     learn_covariances,
 )
-from ctxval.learning.effects.inputs import InputEffects
+from ctxval.learning.effects.model import ModelWithEffects
 from ctxval.learning.effects.mujoco import further_attributes
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.input_effects import Found, input_candidates
@@ -36,10 +37,11 @@ from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import NoiseSettings, NoiseStudy
 from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.parametric_dynamics import ParametricDynamics, ParametricSettings, learned_parameters
-from ctxval.learning.precision import AgreeingDynamics, AgreementSettings, agreeing_posterior
+from ctxval.learning.precision import AgreeingDynamics, agreeing_posterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
 from ctxval.learning.recorded import Memories, data_near, digest, recorded_transitions, scheduled
 from ctxval.learning.regular import RegularSettings, split_transitions
+from ctxval.learning.settling import SettlingModel
 from ctxval.learning.share_search import ShareSearch
 from ctxval.learning.stage_costs import Costs, Ledger, ThinkingSettings, reduced
 from ctxval.learning.structure import StructureSearch, StructureSettings, most_telling
@@ -71,8 +73,8 @@ class DynamicsStudy(ShortRepr):
         validation: the same with the states of M if only outputs are recorded, and with the physical task parameters
             as further states; everything is learned of these.
         target: what is asked for of the distances over all tasks.
-        effects: effects of inputs, with their sizes; empty if commands act as they are.
-        friction: M with the dry friction that it lacks, of which the residual is learned; None without.
+        effects: what the dynamics have beside M and a smooth residual, with sizes: ``within_steps`` and ``of_inputs``.
+        model: M with those effects that change its steps; the residual is learned of it.
         with_data: whether the data that M was made from are learned from.
         settings: the numbers that decide what is learned.
     """
@@ -86,16 +88,18 @@ class DynamicsStudy(ShortRepr):
         settings: LearningSettings | None = None,
         *,
         effects: Found = (),
-        friction: DryFriction | None = None,
         with_data: bool = True,
         memories: Memories | None = None,
     ) -> None:
         self.settings, self.memories = settings or LearningSettings(), memories or Memories()
         self.given, self.seed, self.target = validation, seed, target
-        self.effects, self.friction, self.with_data = effects, friction, with_data
-        of_inputs = InputEffects(tuple(each.effect for each in effects))
+        self.effects, self.with_data = effects, with_data
+        self.within_steps = tuple(each for each in effects if isinstance(each.effect, SettlingModel))
+        self.of_inputs = tuple(each for each in effects if each not in self.within_steps)
+        of_inputs = _with_effects(validation.model, effects).of_inputs
         self.extended = ExtendedValidation(validation, of_inputs) if extended is None else extended
         self.validation = self.extended.validation
+        self.model = _with_effects(before_refinement(self.validation.model), effects).mechanics
         self.planner = LoopPlanner(self.validation, of_inputs)
         self._errors = ErrorVectors(LoopPlanner(validation) if validation.outputs.hide_states else self.planner)
         self._covariances = Latest[bytes, LearnedCovariances | None](8)
@@ -114,22 +118,20 @@ class DynamicsStudy(ShortRepr):
         *,
         given: Validation | None = None,
         effects: Found | None = None,
-        friction: DryFriction | None = None,
         with_data: bool | None = None,
     ) -> DynamicsStudy:
         """Return a study with other parts; the others stay. The latest ones are kept."""
-        given, friction = given or self.given, friction or self.friction
-        kept = self.effects if effects is None else effects
+        given, kept = given or self.given, self.effects if effects is None else effects
         with_data = self.with_data if with_data is None else with_data
-        if (given, kept, friction, with_data) == (self.given, self.effects, self.friction, self.with_data):
+        if (given, kept, with_data) == (self.given, self.effects, self.with_data):
             return self
-        key = tuple(given.physical), kept, friction, with_data
+        key = tuple(given.physical), kept, with_data
         if key not in self._made:
             same = self.extended if given is self.given else self.extended.of(given)
-            extended = same if effects is None else None
+            extended = same if _with_effects(given.model, kept).of_inputs == same.effects else None
             self._made[key] = DynamicsStudy(
                 given, self.seed, self.target, extended, self.settings,
-                effects=kept, friction=friction, with_data=with_data, memories=self.memories,
+                effects=kept, with_data=with_data, memories=self.memories,
             )  # fmt: skip
         return self._made[key]
 
@@ -223,7 +225,7 @@ class DynamicsStudy(ShortRepr):
     def _parametric(self, executed: Executed, ledger: Ledger) -> LearnedDynamics | None:
         """Return what executions teach of the uncertain parameters of M; None if it has none, or nothing is usable."""
         model = uncertain_in(before_refinement(self.validation.model))
-        if model is None or not executed or self.extended.needs_tasks or self.friction is not None:
+        if model is None or not executed or self.extended.needs_tasks or self.effects:
             return None
         loops, on_model, settings = [trajectory for _, trajectory in executed], self.extended.loops, self.settings
         if on_model is None:
@@ -267,7 +269,7 @@ class DynamicsStudy(ShortRepr):
         self, executed: Executed, logged: Sequence[Trajectory], recorded_as: Executed, allowed: float
     ) -> AgreeingDynamics | None:
         """Return M itself, with an error bound, if it explains all executions up to negligible errors."""
-        if not executed or self.friction is not None or self.effects:
+        if not executed or self.effects:
             return None  # M alone does not explain them
         recorded = self.transitions_of(executed, logged, with_data=False)
         if recorded is None:
@@ -299,9 +301,9 @@ class DynamicsStudy(ShortRepr):
                 some = recorded if count == len(executed) else self.transitions_of(executed[:count], logged, with_data)
                 if some is None or self.extended.loops is None:
                     continue
-                model, seed = self.friction or before_refinement(self.validation.model), (self.seed, count, 0)
+                seed = self.seed, count, 0
                 settings = PosteriorSettings.for_horizon(self.extended.loops.horizon)
-                self._covariances[key] = learn_covariances(model, *some, seed, settings)
+                self._covariances[key] = learn_covariances(self.model, *some, seed, settings)
             covariances = self._covariances[key]
             if covariances is not None:
                 return self._conditioned(covariances, recorded, executed, with_data, ledger)
@@ -368,7 +370,7 @@ class DynamicsStudy(ShortRepr):
     def noise(self) -> NoiseStudy:
         """Learns dynamics with noise."""
         settings = self.settings.noise
-        if self.friction is not None:  # what it does within a step would seem to be a history
+        if isinstance(self.model, SettlingModel):  # what friction does within a step would seem to be a history
             settings = replace(settings, structures=tuple(each for each in settings.structures if not each.lags))
         return NoiseStudy(self.extended, self.planner, self.search, self.seed, self.target.quantile, settings)
 
@@ -408,7 +410,7 @@ class DynamicsStudy(ShortRepr):
         if self.extended.loops is None:
             return None
         # The data that M was made from tell no earlier inputs.
-        data = self._data if with_data and not self.effects else None
+        data = self._data if with_data and not self.of_inputs else None
         loops = [loop for _, loop in executed]
         return recorded_transitions(
             self.validation.model, data, loops, self.extended.loops, logged, memories=self.memories
@@ -467,3 +469,7 @@ class DynamicsStudy(ShortRepr):
         if vectors is None or not isinstance(distance, ComposedDistance):
             return None
         return predict_composed(np.array([point for point, _ in executed]), vectors, distance.compose)
+
+
+def _with_effects(model: Model, effects: Found) -> ModelWithEffects:
+    return ModelWithEffects(model, tuple(each.effect for each in effects))

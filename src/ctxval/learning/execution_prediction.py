@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -14,8 +14,10 @@ from ctxval._util.describe import plain_json
 from ctxval._util.representation import ShortRepr
 from ctxval.core.quantiles import LEVELS, chance_of_more
 from ctxval.core.trajectory import Trajectory
-from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.draws import Draws
+
+if TYPE_CHECKING:
+    from ctxval.learning.closed_loops import LoopPlanner
+    from ctxval.learning.draws import Draws
 
 _QUANTILES = np.linspace(0.0, 1.0, 21)  # levels of the stored quantiles of the distance
 

@@ -17,6 +17,7 @@ import scipy
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.model import Model
 from ctxval.core.state_geometry import geometry_of
+from ctxval.core.trajectory import Transitions
 from ctxval.learning.effects.dictionary import kinds
 from ctxval.learning.effects.effect import EffectCandidate, Observed, OfInput, all_sized
 from ctxval.learning.effects.inputs import InputEffects
@@ -25,6 +26,7 @@ from ctxval.learning.effects.transport import Delay, Late
 from ctxval.learning.histories import Record
 from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior, Mode, learning_rows, log_posterior
 from ctxval.learning.residual_data import floors
+from ctxval.learning.settling import SettlingModel
 from ctxval.models.increments import standard_deviations
 
 
@@ -123,13 +125,14 @@ class _Search:
         cls, model: Model, records_of: RecordsOf, candidates: Found, evaluations: int, settings: InputEffectSettings
     ) -> _Search | None:
         """Return the search; None if M misses nothing."""
-        X, U, Y = _transitions(records_of(InputEffects()))
-        (Z, E), inputs = _missed(model, X, U, Y), U.shape[1]
+        steps, teaches = _transitions(model, records_of(InputEffects()))
+        steps, inputs = steps[teaches], steps.u.shape[1]
+        Z, E = _missed(model, steps)
         sizes = np.sqrt((E**2).mean(axis=0))
-        live = sizes > floors(Y, geometry_of(model).difference(Y, X))
+        live = sizes > floors(steps.x_next, geometry_of(model).difference(steps.x_next, steps.x))
         if not live.any() or not np.isfinite(sizes).all():
             return None
-        rows = learning_rows(_standardised(Z), inputs, settings.learned_from)
+        rows = teaches[learning_rows(_standardised(Z), inputs, settings.learned_from)]
         return cls(model, records_of, candidates, rows, live, sizes, inputs, evaluations, settings)
 
     @property
@@ -140,8 +143,7 @@ class _Search:
     def data(self, effects: Found) -> tuple[Array, Array]:
         """Return states and acting inputs ``(N, n + m)``, and residuals over their sizes if commands act at once."""
         records = self.records_of(InputEffects(tuple(each.effect for each in effects)))
-        X, U, Y = (part[self.rows] for part in _transitions(records))
-        Z, E = _missed(self.model, X, U, Y)
+        Z, E = _missed(self.model, _transitions(self.model, records)[0][self.rows])
         if not np.isfinite(E).all():
             raise np.linalg.LinAlgError
         return Z, E[:, self.live] / self.sizes[self.live]
@@ -219,17 +221,21 @@ class _Search:
         return all_sized(effects, likely[:-1].tolist())
 
 
-def _transitions(records: Sequence[Record]) -> tuple[Array, Array, Array]:
-    """Return states, acting inputs and next states of all steps, ``(N, n)``, ``(N, m)`` and ``(N, n)``."""
-    states = [each.states for each in records]
-    X, Y = np.concatenate([x[:-1] for x in states]), np.concatenate([x[1:] for x in states])
-    return X, np.concatenate([each.inputs for each in records]), Y
+def _transitions(model: Model, records: Sequence[Record]) -> tuple[Transitions, Rows]:
+    """Return all steps with the inputs that act, and the rows of those that teach what M misses."""
+    states, u = [each.states for each in records], np.concatenate([each.inputs for each in records])
+    steps = Transitions(np.concatenate([x[:-1] for x in states]), u, np.concatenate([x[1:] for x in states]))
+    if not isinstance(model, SettlingModel):
+        return steps, np.arange(len(steps))
+    steps, teaches = model.teaching(steps)
+    return steps, np.flatnonzero(teaches)
 
 
-def _missed(model: Model, X: Array, U: Array, Y: Array) -> tuple[Array, Array]:
+def _missed(model: Model, steps: Transitions) -> tuple[Array, Array]:
     """Return states and inputs as regressors ``(N, k)``, and what M misses of the next states ``(N, n)``."""
-    geometry = geometry_of(model)
-    return np.concatenate([geometry.features(X), U], axis=1), geometry.missed(Y, np.asarray(model.step(X, U)), X)
+    model, geometry = model.given if isinstance(model, SettlingModel) else model, geometry_of(model)
+    missed = geometry.missed(steps.x_next, np.asarray(model.step(steps.x, steps.u)), steps.x)
+    return np.concatenate([geometry.features(steps.x), steps.u], axis=1), missed
 
 
 def _standardised(Z: Array) -> Array:

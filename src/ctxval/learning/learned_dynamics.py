@@ -29,11 +29,13 @@ from ctxval.learning.coverage import (
 )
 from ctxval.learning.draws import Draws, DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
+from ctxval.learning.effects.dry_friction import DryFriction
 from ctxval.learning.effects.inputs import labelled_sizes
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.regular import Boundary, RegularTransitions
 from ctxval.learning.rest_places import RestPlaces, rest_places, untested_rest
+from ctxval.learning.settling import SettlingModel
 from ctxval.learning.stage_costs import Costs, Ledger
 from ctxval.learning.tolerance import push_response
 from ctxval.learning.worst_case import WorstCase, WorstCaseSearch
@@ -193,7 +195,7 @@ class LearnedDynamics(ShortRepr):
     def screened(self) -> WorstCase:
         """The largest distance over some tasks, for each of a few draws of the dynamics: a quick lower bound."""
         replicates = 1 if self.noisy is None else self.noisy.replicates
-        settings, rests = self.search.settings, self.posterior.resting is not None
+        settings, rests = self.search.settings, isinstance(self.posterior.model, SettlingModel)
         stage = "posterior samples in the choice of a task"
         if not self.ledger.fits(
             "loops", lambda costs: costs.screening(settings, replicates, rests), self.ledger.reserve
@@ -290,7 +292,7 @@ class LearnedDynamics(ShortRepr):
     @property
     def acting(self) -> dict[str, float]:
         """The sizes of effects of inputs by their labels; empty if commands act as they are."""
-        return labelled_sizes(self.study.effects, self.study.input_names(self.posterior.data.inputs))
+        return labelled_sizes(self.study.of_inputs, self.study.input_names(self.posterior.data.inputs))
 
     @property
     def friction(self) -> dict[str, float]:
@@ -298,10 +300,10 @@ class LearnedDynamics(ShortRepr):
 
         If the executions permit more at rest, that follows, and its share of the input if it grows with it.
         """
-        friction, resting, sizes = self.study.friction, self.posterior.resting, dict[str, float]()
-        if friction is not None and resting is not None:
+        friction, sizes = self.posterior.model, dict[str, float]()
+        if isinstance(friction, DryFriction) and friction.told is not None:
             of_inputs = self.labels[-self.posterior.data.inputs :]
-            each_input = np.stack([friction.sliding, resting[1].max(axis=0), friction.load], axis=1).tolist()
+            each_input = np.stack([friction.sliding, friction.told.largest.max(axis=0), friction.load], axis=1).tolist()
             for label, (sliding, at_rest, load) in zip(of_inputs, each_input, strict=True):
                 name, _ = parted(label)
                 sizes[label] = sliding
@@ -337,8 +339,6 @@ class LearnedDynamics(ShortRepr):
     def _rest_places(self) -> list[RestPlaces]:
         """Where the friction at rest of each joint is tested, and where predicted runs need it."""
         planner, search = self.study.planner, self.search
-        if self.posterior.pushes is None:
-            return []
         with single_threaded(), np.errstate(all="ignore"):
             return rest_places(self.posterior, planner, search.pool, search.plans, self._pool_loops)
 
@@ -477,8 +477,9 @@ class LearnedDynamics(ShortRepr):
     @property
     def uneven_friction(self) -> float:
         """By how many times a force that a joint withstood exceeds one that moved it; 1 if none does."""
-        resting = self.posterior.resting
-        return 1.0 if resting is None else float(resting[3].max())
+        friction = self.posterior.model
+        told = friction.told if isinstance(friction, DryFriction) else None
+        return 1.0 if told is None else float(told.uneven.max())
 
     def _rng(self, purpose: int) -> np.random.Generator:
         return np.random.default_rng([self.study.seed, len(self.executed), purpose])

@@ -174,7 +174,7 @@ class NoiseStudy:
         data = posterior.data
         try:
             with single_threaded(), np.errstate(all="ignore"):
-                model, pairs = posterior.with_most_friction, self.extended.pairs
+                model, pairs = posterior.model_with(1.0), self.extended.pairs
                 settings = replace(self.settings, structures=structures)
                 fit, chosen = fit_structures(model, records, pairs, data.learned, chosen, settings)
         except (np.linalg.LinAlgError, InputError, ValueError):  # numbers that are not finite

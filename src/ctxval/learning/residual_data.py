@@ -16,8 +16,8 @@ from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.model import Model, predicted_steps
 from ctxval.core.state_geometry import PLAIN, StateGeometry, geometry_of
 from ctxval.core.trajectory import Transitions
-from ctxval.learning.dry_friction import DryFriction
 from ctxval.learning.hyperparameters import FAMILIES, Climbs, ResidualKernel, climbed, learning_rows
+from ctxval.learning.settling import SettlingModel
 from ctxval.models.increments import standard_deviations, standardised_pairs
 from ctxval.models.linear import Linear
 
@@ -100,17 +100,17 @@ def residual_data(
     """
     geometry = geometry_of(model) if geometry is None else geometry
     recorded = np.concatenate([geometry.features(transitions.x), transitions.u], axis=1)
-    every, moving = transitions, np.ones(len(transitions), dtype=np.bool_)
-    if isinstance(model, DryFriction):
-        transitions, moving = model.acting(transitions)
-        model = model.model
+    every, teaches = transitions, np.ones(len(transitions), dtype=np.bool_)
+    if isinstance(model, SettlingModel):
+        transitions, teaches = model.teaching(transitions)
+        model = model.given
     with np.errstate(all="ignore"):
         residuals = geometry.missed(transitions.x_next, predicted_steps(model, transitions), transitions.x)
         steps = geometry.difference(transitions.x_next, transitions.x)
     pairs = np.concatenate([geometry.features(transitions.x), transitions.u], axis=1)
     # Larger numbers have diverged, and their squares would not be finite.
     usable = (np.abs(np.concatenate([pairs, residuals, steps], axis=1)) < 1e100).all(axis=1)
-    teach = usable & moving
+    teach = usable & teaches
     if teach.sum() < 2:
         return None
     pairs, residuals = pairs[teach], residuals[teach]

@@ -17,8 +17,8 @@ from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.coverage import UntestedRest
 from ctxval.core.trajectory import Transitions
 from ctxval.learning.closed_loops import LoopPlanner, Loops, PlannedTasks
-from ctxval.learning.dry_friction import DryFriction
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
+from ctxval.learning.effects.dry_friction import DryFriction
 
 
 @dataclass(frozen=True)
@@ -175,10 +175,10 @@ def rest_places(
 
     The loops are those of the pool's tasks on the posterior mean, without noise.
     """
-    friction, steps, places = posterior.covariances.model, posterior.data.executions, list[RestPlaces]()
-    pushes = posterior.pushes
-    if not isinstance(friction, DryFriction) or pushes is None:
+    friction, steps, places = posterior.model, posterior.data.executions, list[RestPlaces]()
+    if not isinstance(friction, DryFriction) or friction.told is None:
         return places
+    pushes = friction.told.pushes
     for j, coordinate in enumerate(friction.coordinates(steps)):
         shown = float(friction.rest[:, j].max())
         if coordinate is None or not shown > 0:
@@ -213,8 +213,9 @@ def predicted_departures(
     errors: Array,
 ) -> Departures:
     """Return where a joint leaves rest, or turns, in closed loops on the posterior mean."""
-    friction = posterior.covariances.model
+    friction = posterior.model
     assert isinstance(friction, DryFriction)
+    assert friction.told is not None
     rate, found = int(friction.rates[joint]), list[tuple[Array, Array, Rows]]()
     slow = friction.still[joint] / friction.settings.held
     for plan, each in zip(planned, loops, strict=True):
@@ -225,7 +226,7 @@ def predicted_departures(
         task, step = np.nonzero(may & np.isfinite(x).all(axis=2)[:, 1:])
         if len(task):
             some = Transitions(x[task, step], u[task, step], x[task, step + 1])
-            pushes = posterior.pushes_in(some, errors)
+            pushes = friction.pushes(some, friction.told.missed, errors)
             which = (pushes.started | pushes.turned)[:, joint]
             found.append((some.x[which, coordinate], pushes.force[which, joint], plan.rows[task[which]]))
     if not found:

@@ -14,15 +14,16 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval.core.task import Task
 from ctxval.core.validation import Validation
-from ctxval.learning.dynamics_posterior import PosteriorSettings
-from ctxval.learning.worst_case import WorstCaseSettings
+
+if TYPE_CHECKING:
+    from ctxval.learning.worst_case import WorstCaseSettings
 
 
 @dataclass(frozen=True)
@@ -172,6 +173,8 @@ class Sizes:
     @classmethod
     def of(cls, speed: Speed, dimension: int, executions: int, known: int) -> Self:
         """Return the sizes after so many executions, with so many known transitions beside them."""
+        from ctxval.learning.dynamics_posterior import PosteriorSettings  # imported here: a stored speed needs it not
+
         transitions = min(executions * speed.horizon + known, 3000)
         centres = min(transitions, PosteriorSettings.for_horizon(speed.horizon).centres)
         sizes = speed.states, speed.inputs, speed.horizon, transitions, executions, dimension

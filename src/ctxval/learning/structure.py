@@ -9,15 +9,17 @@ with its parts.
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctxval._util.arrays import single_threaded
+from ctxval._util.arrays import Mask, Rows, single_threaded
 from ctxval.errors import InputError
-from ctxval.learning.dry_friction import FrictionSettings, found_friction
+from ctxval.learning.effects.dry_friction import DryFriction, FrictionSettings, found_friction
+from ctxval.learning.effects.effect import EffectCandidate
 from ctxval.learning.effects.inputs import InputEffects
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
@@ -25,6 +27,7 @@ from ctxval.learning.input_effects import Found, InputEffectSettings, found_effe
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.prediction import Executed
 from ctxval.learning.recorded import digest, schedule
+from ctxval.learning.settling import SettlingModel
 from ctxval.learning.stage_costs import Costs, Ledger
 from ctxval.models.corrected import before_refinement
 
@@ -51,6 +54,7 @@ class StructureSettings:
 
     inputs: PartLimits = PartLimits(3, 0.02, 0.95)  # the evidence decides
     friction: PartLimits = PartLimits(4, 0.1, 0.5)
+    friction_beside: PartLimits = PartLimits(4, 0.1, 0.95)  # beside a Gaussian process; its evidence decides
     data: PartLimits = PartLimits(3, 0.1, 1 / 3, 0.1)
     parameter: PartLimits = PartLimits(6, 0.1, 1 / 3, 0.1)
     enough: float = 0.02  # left-out error below which no further part is compared
@@ -70,6 +74,7 @@ class Part:
     seconds: Callable[[Costs], float]
     add: Callable[[DynamicsStudy, Executed], DynamicsStudy | None]  # a study with it; None if it explains nothing
     has: Callable[[DynamicsStudy], bool]
+    last: bool = False  # whether it is tried only if no other one explains enough
 
 
 class StructureSearch:
@@ -79,16 +84,19 @@ class StructureSearch:
         self.plain, self.settings = plain, settings
         self._known: dict[bytes, DynamicsStudy] = {}
         names, single = len(plain.given.space.units) + 1, settings.input_effects.single
-        friction = Part(
-            "dry friction", settings.friction, Costs.friction,
-            self.with_friction, lambda study: study.friction is not None,
-        )  # fmt: skip
+        friction = [
+            Part(
+                "dry friction", limits, Costs.friction,
+                functools.partial(self.with_friction, beside=beside), lambda study: bool(study.within_steps), beside,
+            )
+            for limits, beside in ((settings.friction, False), (settings.friction_beside, True))
+        ]  # fmt: skip
         self.parts = [
             Part(
                 "inputs that act late", settings.inputs, lambda costs: costs.input_effects(single),
-                self.with_inputs, lambda study: bool(study.effects),
+                self.with_inputs, lambda study: bool(study.of_inputs),
             ),
-            *([] if plain.given.outputs.hide_states else [friction]),
+            *([] if plain.given.outputs.hide_states else friction),
             Part("the data of M", settings.data, Costs.learning, _without_data, lambda study: not study.with_data),
             Part(
                 "parameters that change the dynamics", settings.parameter, lambda costs: names * costs.learning(),
@@ -129,11 +137,11 @@ class StructureSearch:
             best: tuple[float, LearnedDynamics] | None = None
             if learned is None:
                 break
-            for part in asked:
+            for part in sorted(asked, key=lambda part: part.last):
                 limits = part.limits
                 if part.has(study) or len(executed) < limits.after or not learned.left_out_error > limits.error:
                     continue
-                tried = part.add(study, executed)
+                tried = None if part.last and best is not None else part.add(study, executed)
                 found = None if tried is None else tried.learned_alone(executed)
                 if found is None:
                     continue
@@ -153,10 +161,10 @@ class StructureSearch:
         if before is self.plain:
             return before
         study = self.plain.made(given=before.given, with_data=before.with_data)
-        if before.effects:
-            study = self.with_inputs(study, executed, before.effects) or study
-        if before.friction is not None:
-            study = self.with_friction(study, executed) or study.made(friction=before.friction)
+        if before.of_inputs:
+            study = self.with_inputs(study, executed, before.of_inputs) or study
+        if before.within_steps:
+            study = self._with_friction_again(study, executed, before.within_steps)
         return study
 
     # Parts
@@ -164,8 +172,6 @@ class StructureSearch:
     def with_inputs(self, study: DynamicsStudy, executed: Executed, before: Found = ()) -> DynamicsStudy | None:
         """Return a study with the effects of inputs that executions show; those found before are the first guess."""
         given, estimated = study.given, study.given.outputs.hide_states
-        if study.friction is not None:
-            return None  # its steps at rest teach nothing of inputs that act late
         among = executed[-self.settings.estimated_from :] if estimated else executed
         commanded = [trajectory.inputs for _, trajectory in among]
         alike = len({u.shape for u in commanded}) == 1
@@ -183,29 +189,43 @@ class StructureSearch:
 
         # If states are recorded, they are the same with all effects.
         plain = [] if estimated else estimated_with(InputEffects())
-        model = before_refinement(study.validation.model)
         # If states have to be estimated each time, or with many inputs, single ones cost too much.
         together = estimated or commanded[0].shape[-1] > self.settings.input_effects.single
         candidates = study.input_candidates([trajectory for _, trajectory in among], together=together)
         with single_threaded(), np.errstate(all="ignore"):
             found = found_effects(
-                model, estimated_with if estimated else with_inputs, candidates, before,
+                study.model, estimated_with if estimated else with_inputs, candidates, before,
                 estimated=estimated, settings=self.settings.input_effects,
             )  # fmt: skip
-        return study.made(effects=found) if found else None
+        if not found:
+            return None
+        late = study.made(effects=found)
+        return self._with_friction_again(late, executed, study.within_steps) if study.within_steps else late
 
-    def with_friction(self, study: DynamicsStudy, executed: Executed) -> DynamicsStudy | None:
-        """Return a study with the dry friction that executions show."""
+    def _with_friction_again(self, study: DynamicsStudy, executed: Executed, before: Found) -> DynamicsStudy:
+        """Return a study with dry friction as it was found before, with sizes for these executions."""
+        beside = any(isinstance(each.effect, DryFriction) and each.effect.beside for each in before)
+        return self.with_friction(study, executed, beside) or study.made(effects=(*study.effects, *before))
+
+    def with_friction(self, study: DynamicsStudy, executed: Executed, beside: bool = False) -> DynamicsStudy | None:
+        """Return a study with the dry friction that executions show, which may be hidden beside what M misses."""
         extended, model = study.extended.executions(executed), before_refinement(study.validation.model)
         recorded = study.transitions_of(extended, with_data=False) if extended else None
+        learned = study.made(effects=study.of_inputs).learned_alone(executed) if beside else None
+        if recorded is None or (beside and learned is None):
+            return None
         friction, settings = None, self.settings.dry_friction
-        with single_threaded(), np.errstate(all="ignore"), contextlib.suppress(RuntimeError):  # of the least squares
-            friction = None if recorded is None else found_friction(model, recorded[0], settings)
-        return None if friction is None else study.made(friction=friction)
+        prior = None if learned is None else learned.posterior.prior
+        # Least squares may fail, and so may the factor of a covariance.
+        with single_threaded(), np.errstate(all="ignore"), contextlib.suppress(RuntimeError, InputError):
+            friction = found_friction(model, recorded[0], settings, prior)
+        if friction is None:
+            return None
+        return study.made(effects=(*study.of_inputs, EffectCandidate(friction)))
 
 
 def _without_data(study: DynamicsStudy, executed: Executed) -> DynamicsStudy | None:
-    return study.made(with_data=False) if study.has_data and not study.effects else None
+    return study.made(with_data=False) if study.has_data and not study.of_inputs else None
 
 
 def most_telling(study: DynamicsStudy, executed: Executed) -> tuple[DynamicsStudy | None, float, float]:
@@ -231,9 +251,10 @@ def share_left(found: LearnedDynamics, without: LearnedDynamics, settings: Struc
     What the Gaussian processes take for noise is no part of them. Of dry friction, only the rates that it slows count:
     where a joint stops within a step changes its position a little, which nothing predicts.
     """
-    friction, n = found.study.friction, len(without.error_units)
-    alone = friction is not None and without.study.friction is None
-    states = friction.rates if friction is not None and alone else without.posterior.data.learned
+    model, n = found.study.model, len(without.error_units)
+    states: Rows | Mask = without.posterior.data.learned
+    if isinstance(model, SettlingModel) and not isinstance(without.study.model, SettlingModel):
+        states = model.rates
     units = without.error_units
     noise = float(((found.posterior.deviations[:n] / units)[states] ** 2).sum())
     squares, squares_without = (

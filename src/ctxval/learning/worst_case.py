@@ -23,6 +23,7 @@ from ctxval.gp.global_search import search_globally
 from ctxval.learning.closed_loops import AnyPosterior, LoopPlanner, PlannedTasks, loop_pairs
 from ctxval.learning.draws import Draws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
+from ctxval.learning.settling import SettlingModel
 
 _DIVERGED = 1e30  # the distance of a loop that diverges, in searches: larger than all others, and finite
 
@@ -382,7 +383,7 @@ class SuiteSearch(WorstCaseSearch):
 
 def _sticks(posterior: AnyPosterior) -> bool:
     """Return whether draws differ in the dry friction at rest."""
-    return isinstance(posterior, DynamicsPosterior) and posterior.resting is not None
+    return isinstance(posterior, DynamicsPosterior) and isinstance(posterior.model, SettlingModel)
 
 
 def is_kinked(distance: object) -> bool:

@@ -178,7 +178,7 @@ class Chart(ShortRepr):
 
     def edges(self, segments: Array, label: str) -> Chart:
         """Add line segments on a map ``(k, 2, 2)``: black under dashed white, which is visible on every colour."""
-        at = self._at(segments[..., 0], segments[..., 1])
+        at = self._at(np.clip(segments[..., 0], *self.x.ends), np.clip(segments[..., 1], *self.y.ends))
         path = "".join(f"M{a:.1f},{b:.1f}L{c:.1f},{d:.1f}" for (a, b), (c, d) in at.tolist())
         kinds = ("edge-under", "edge")
         self._named(label, *(element("path", d="M1,8H25", class_=f"line {kind}") for kind in kinds))

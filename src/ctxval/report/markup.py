@@ -6,6 +6,7 @@ from a store can neither script the page nor change its layout.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -80,9 +81,16 @@ def joined(parts: Iterable[object]) -> Markup:
     return Markup("").join(map(text, parts))
 
 
+def with_code(value: object) -> Markup:
+    """Return a text whose commands, between backquotes, are code; elements stay as they are."""
+    return (
+        text(value) if hasattr(value, "__html__") else Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(text(value))))
+    )
+
+
 def paragraph(*children: object, class_: str | None = None) -> Markup:
     """Return a paragraph."""
-    return element("p", *children, class_=class_)
+    return element("p", *(with_code(child) for child in children if child is not None), class_=class_)
 
 
 def heading(words: object, level: int = 3) -> Markup:
@@ -92,7 +100,7 @@ def heading(words: object, level: int = 3) -> Markup:
 
 def bullets(items: Iterable[object]) -> Markup:
     """Return a list."""
-    return element("ul", *(element("li", item) for item in items))
+    return element("ul", *(element("li", with_code(item)) for item in items))
 
 
 def table(

@@ -10,8 +10,8 @@ import pytest
 from ctxval import Array, models
 from ctxval.core.trajectory import Transitions
 from ctxval.learning import effects
-from ctxval.learning.dry_friction import found_friction
 from ctxval.learning.effects import Joint, ModelWithEffects
+from ctxval.learning.effects.dry_friction import DryFriction, found_friction
 from ctxval.learning.effects.flow import Flow
 
 DT = 0.05
@@ -78,3 +78,14 @@ def test_friction_by_direction_brakes_each_way_by_its_own_size() -> None:
     x, u = np.array([[0.0, 1.0], [0.0, -1.0], [0.0, 0.0], [0.0, 0.0]]), np.array([[0.0], [0.0], [0.39], [-0.21]])
     rates = [1.0 - 0.4 * DT, -1.0 + 0.2 * DT, 0.0, -0.01 * DT]
     np.testing.assert_allclose(friction.step(x, u)[:, 1], rates, atol=1e-12)
+
+
+def test_the_friction_of_verdicts_falls_with_the_rate_by_the_same_law() -> None:
+    law = ModelWithEffects(MODEL, (effects.Stribeck((0.4, 0.3, 0.2), **FORCE),))
+    numbers = np.ones(1), np.zeros(1), np.full(1, 1e-3), np.zeros(1)
+    rest, passed = np.full((2, 1), 0.7), np.full(1, np.inf)
+    of_verdicts = DryFriction((0.4, 0.0, 0.3, 0.2), MODEL, np.array([1]), *numbers, rest, passed)
+    x, u = np.array([[0.0, 1.0], [0.0, 0.3], [0.0, -0.25], [0.0, 0.0]]), np.array([[0.0], [1.0], [-0.5], [0.6]])
+    np.testing.assert_allclose(
+        of_verdicts.step(x, u), law.step(x, u), atol=1e-4
+    )  # the sliding rate is found by iterations

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
+import scipy
 
 from ctxval._util.arrays import Array, rows_of
 from ctxval.learning.effects.effect import EffectCandidate, Observed, Parameter, beside, of_size
@@ -15,6 +16,15 @@ from ctxval.learning.effects.force import Force, force_parameter, limited
 from ctxval.learning.effects.plant import Joint, Plant
 
 Where = tuple[Joint, float, float]
+
+
+def slowness(before: Array, after: Array, slow: Any) -> Array:
+    """Return the mean of ``exp(-(rate / slow)^2)`` over steps in which rates change evenly; all shapes ``(..., m)``."""
+    first, last = before / slow, after / slow
+    same = np.abs(last - first) < 1e-4
+    mean = scipy.special.erf(last) - scipy.special.erf(first)
+    mean = 0.5 * np.sqrt(np.pi) * mean / np.where(same, 1.0, last - first)
+    return np.asarray(np.where(same, np.exp(-(first**2)), mean))
 
 
 @dataclass(frozen=True)
@@ -127,7 +137,7 @@ class Stribeck(Force):
 
     def force(self, before: Array, rate: Array, load: Array | float, stopping: Array) -> Array:
         sliding, added, slow = self.sizes
-        return limited(stopping, sliding + added * np.exp(-((rate / np.maximum(slow, 1e-12)) ** 2)))
+        return limited(stopping, sliding + added * slowness(before, 2 * rate - before, np.maximum(slow, 1e-12)))
 
     def sentence(self, plant: Plant) -> str:
         sliding, added, slow = self.sizes

@@ -120,7 +120,7 @@ def _remarks(context: ReportContext) -> list[Markup]:
     for light in ("bad", "attention"):
         if names := [finding.name for finding in findings if finding.light == light]:
             word = element("span", WORDS[light].capitalize(), class_=f"light {light}")
-            remarks.append(paragraph(word, f" {'; '.join(names)} (below)"))
+            remarks.append(paragraph(word, f" {'; '.join(names)} (below)", class_="remark"))
     if context.missing:
         remarks.append(paragraph(f"The experiment is not loaded: {context.missing}", class_="note"))
     others = context.provenance.beside

@@ -17,7 +17,8 @@ from ctxval._util.arrays import Array
 from ctxval.core.target import Largest
 from ctxval.core.trajectory import Transitions
 from ctxval.learning import DynamicsStudy
-from ctxval.learning.dry_friction import DryFriction, found_friction
+from ctxval.learning.effects import Delay, ModelWithEffects
+from ctxval.learning.effects.dry_friction import DryFriction, found_friction
 from facts import assert_names
 from rig_thorough import more
 
@@ -43,8 +44,11 @@ def sticky_step(
 
 def rubbing(model: models.Linear, rates: list[int], sliding: Array) -> DryFriction:
     m = len(rates)
-    sizes = sliding, *np.zeros((2, m)), np.ones(m), np.zeros(m), np.full(m, 1e-3), np.zeros(m)
-    return DryFriction(model, np.array(rates), *sizes, rest=np.stack([sliding] * 2), passed=np.full(m, np.inf))
+    sizes = tuple(np.stack([sliding, *np.zeros((2, m)), np.ones(m)], axis=1).ravel().tolist())
+    rest, passed = np.stack([sliding] * 2), np.full(m, np.inf)
+    return DryFriction(
+        sizes, model, np.array(rates), np.ones(m), np.zeros(m), np.full(m, 1e-3), np.zeros(m), rest, passed
+    )
 
 
 def recorded(step: Any, count: int = 300, inputs: int = 1) -> Transitions:
@@ -70,22 +74,24 @@ def test_what_holds_a_joint_at_rest_is_bounded_by_what_it_withstood_and_what_set
     x, inputs = np.concatenate([moving.x, still]), np.concatenate([moving.u, u])
     known = rubbing(MODEL, [1], np.array([GRIP]))
 
-    def missed(acting: Array) -> Array:
+    def missed(x: Array, acting: Array) -> Array:
         return sticky_step(x, acting, 0.0) - MODEL.step(x, acting)
 
     transitions = Transitions(x, inputs, step(x, inputs))
-    least, largest, passed, uneven = known.resting(transitions, known.pushes(transitions, missed))
-    assert (uneven == 1).all()
+    told = known.told_by(transitions, missed)
+    assert told.told is not None
+    least, largest = told.told.least, told.told.largest
+    assert (told.told.uneven == 1).all()
     # At another place, the joint withstands three times the force that moved it here.
     place = np.array([[0.8, 0.0]])
     at, pushes = np.concatenate([x, place]), np.concatenate([inputs, [[3.9]]])
     caught = Transitions(at, pushes, np.concatenate([transitions.x_next, place]))
-    pushed = known.pushes(caught, lambda acting: sticky_step(at, acting, 0.0) - MODEL.step(at, acting))
-    ratios = known.resting(caught, pushed)[3]
-    assert ratios[1, 0] == pytest.approx(3.9 / 2.0, rel=0.05)
+    elsewhere = known.told_by(caught, missed).told
+    assert elsewhere is not None
+    assert elsewhere.uneven[1, 0] == pytest.approx(3.9 / 2.0, rel=0.05)
     assert least[:, 0] == pytest.approx([1.1, GRIP], abs=0.01)
     assert largest[:, 0] == pytest.approx([1.3, 2.0], abs=0.02)
-    assert passed[0] > GRIP
+    assert told.passed[0] > GRIP
     held = replace(known, rest=np.array([[1.2], [1.2]]))
     np.testing.assert_allclose(held.following(still, u, lambda acting: 0 * still)[:2], 0.0, atol=1e-12)
     slid = DT * np.sign(u[2:, 0]) * (np.abs(u[2:, 0]) - GRIP)
@@ -116,6 +122,17 @@ def test_its_size_is_in_units_of_the_input_if_the_model_errs_in_what_an_input_do
     friction = found_friction(weak, recorded(sticky_step))
     assert friction is not None
     assert friction.sliding[0] == pytest.approx(GRIP, rel=0.02)
+
+
+def test_it_is_found_at_an_input_that_drives_its_joint_backwards() -> None:
+    backwards, steps = models.Linear(MODEL.A, -MODEL.B), recorded(lambda x, u: sticky_step(x, -u))
+    friction = found_friction(backwards, steps)
+    assert friction is not None
+    assert friction.sliding[0] == pytest.approx(GRIP, rel=0.02)
+    there, moving = friction.teaching(steps)
+    left = there.x_next - backwards.step(there.x, there.u)
+    np.testing.assert_allclose(left[moving, 1], -DT * 0.3 * steps.x[moving, 1], atol=0.02)  # drag alone
+    assert np.abs(friction.step(np.zeros((2, 2)), np.array([[0.7], [-0.7]]))[:, 1]).max() < 1e-12
 
 
 @pytest.mark.parametrize("excess", [0.0, 0.4])
@@ -195,16 +212,18 @@ def test_a_joint_that_creeps_while_it_is_held_is_found_to_do_so() -> None:
     start, push = np.array([[0.3, 0.0]]), np.array([[0.95]])
     begun = np.concatenate([x, start]), np.concatenate([u[:, None], push])
     steps = Transitions(*begun, creeping(*begun))
-    least, *_ = friction.resting(steps, friction.pushes(steps, lambda acting: np.zeros_like(begun[0])))
+    told = friction.told_by(steps, lambda x, acting: np.zeros_like(x)).told
+    assert told is not None
     assert creeping(start, push)[0, 1] < 2 * 0.006 * 0.95
-    assert least[:, 0] == pytest.approx(GRIP, rel=0.02)
+    assert told.least[:, 0] == pytest.approx(GRIP, rel=0.02)
     # A joint that begins to creep does not move yet.
     start, push = np.array([[0.3, 0.0]]), np.array([[2.0]])
     x, u = np.concatenate([x, start]), np.concatenate([u[:, None], push])
     steps = Transitions(x, u, creeping(x, u))
-    least, largest, *_ = friction.resting(steps, friction.pushes(steps, lambda acting: np.zeros_like(x)))
-    assert least[:, 0] == pytest.approx(GRIP, rel=0.02)
-    assert largest[1, 0] == pytest.approx(2.0, rel=0.05)
+    told = friction.told_by(steps, lambda x, acting: np.zeros_like(x)).told
+    assert told is not None
+    assert told.least[:, 0] == pytest.approx(GRIP, rel=0.02)
+    assert told.largest[1, 0] == pytest.approx(2.0, rel=0.05)
 
 
 def test_two_inputs_of_one_rate_have_no_friction_of_their_own() -> None:
@@ -249,6 +268,26 @@ def test_runs_that_stop_short_are_predicted_from_few_executions(
     assert learned.noisy is None  # what friction does within a step is no history
     expected, distances_ = learned.expected(points[count:]), [run.distance for run in runs[count:]]
     np.testing.assert_allclose(expected, distances_, rtol=0, atol=0.05 * max(distances_))
+
+
+def test_friction_and_a_delay_are_found_together_in_any_order() -> None:
+    late = ModelWithEffects(models.Function(sticky_step, vectorized=True), (Delay((2.0,)),), 1)
+    validation = cart().with_parts(system=late)
+    points = np.random.default_rng(0).random((10, 2))
+    runs = [validation.outcome(validation.space.from_unit(point)) for point in points]
+    executed = [(point, run.system_trajectory) for point, run in zip(points[:6], runs, strict=False)]
+    study = DynamicsStudy(validation)
+    learned = study.learn(executed)
+    assert learned is not None
+    assert learned.acting == pytest.approx({"delay [steps]": 2.0}, rel=0.05)
+    assert learned.friction["u[0]"] == pytest.approx(GRIP, rel=0.1)
+    expected, distances_ = learned.expected(points[6:]), [run.distance for run in runs[6:]]
+    np.testing.assert_allclose(expected, distances_, rtol=0, atol=0.1 * max(distances_))
+    within = study.made(effects=learned.study.within_steps)
+    both = study.structures.with_inputs(within, executed)
+    assert both is not None
+    assert [type(each.effect) for each in both.effects] == [Delay, DryFriction]
+    assert both.effects[0].effect.sizes == pytest.approx((2.0,), rel=0.05)
 
 
 @pytest.mark.thorough

@@ -15,15 +15,19 @@ it in motion.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
 
 import numpy as np
 import scipy
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows
 from ctxval.core.model import Model
-from ctxval.core.state_geometry import geometry_of
 from ctxval.core.trajectory import Transitions
+from ctxval.gp.cholesky import CholeskyFactor
+from ctxval.learning.effects.effect import Effect
+from ctxval.learning.effects.friction import slowness
+from ctxval.learning.settling import SettlingModel
 from ctxval.models.increments import standard_deviations
 
 
@@ -35,8 +39,10 @@ class FrictionSettings:
     """
 
     explained: float = 0.7  # share of the squared residuals, beside a linear function, that must be left at most
+    explained_beside: float = 0.5  # the same, beside a Gaussian process
     better_shape: float = 0.5  # the same, if friction has one more shape
     per_coefficient: int = 5  # fewest recorded steps for each coefficient of the linear function
+    most: int = 400  # recorded steps beside a Gaussian process
     varied: float = 0.1  # least share of the squares of inputs that no linear function of the state has
     at_rest: float = 0.05  # share of a rate below which the joint is at rest
     held: float = 0.2  # share of at_rest below which a joint is held; one that stops is faster
@@ -65,39 +71,61 @@ class Pushes:
 
 
 @dataclass(frozen=True, eq=False)
-class DryFriction:
-    """M with dry friction at its inputs."""
+class AtRest:
+    """What steps tell of the friction that holds joints, against pushes below and above 0 ``(2, m)``."""
 
-    model: Model
+    least: Array
+    largest: Array
+    uneven: Array  # ratios of a force that was withstood to one that moved the joint; 1 if it may be even everywhere
+    pushes: Pushes  # of these steps
+    missed: Callable[[Array, Array], Array]  # what M misses at states and acting inputs
+
+
+@dataclass(frozen=True, eq=False)
+class DryFriction(Effect, SettlingModel):
+    """Dry friction at the m inputs, in their units; it is also M with this friction.
+
+    Sizes: for each input the largest friction if its joint moves fast and no input acts, by how much it grows with a
+    unit of the input, by how much it is larger at rest, and the rate at which this excess has fallen to 37 %.
+    """
+
+    name: ClassVar[str] = "dry friction"
+    sliding: Array = field(init=False, repr=False)
+    load: Array = field(init=False, repr=False)
+    excess: Array = field(init=False, repr=False)
+    slow: Array = field(init=False, repr=False)
+    given: Model
     rates: Rows  # the state that each input drives (m,)
-    sliding: Array  # the largest friction at each input if its joint moves fast and no input acts, in its units (m,)
-    load: Array  # by how much larger it is for a unit of the input (m,)
-    excess: Array  # by how much larger it is at rest (m,)
-    slow: Array  # the rate at which the excess has fallen to 37 % (m,)
+    signs: Array  # -1 if an input drives its joint backwards, or 1 (m,)
     creep: Array  # the rate at which a held joint creeps under a unit of its input (m,)
     change: Array  # by which inputs are changed to see what they do (m,)
     still: Array  # the largest rate of a joint at rest (m,)
     rest: Array  # the largest friction at rest against pushes below and above 0 (2, m), or of draws (S, 1, 2, m)
     passed: Array  # the largest friction that holds a joint as it turns (m,)
     settings: FrictionSettings = FrictionSettings()
+    beside: bool = False  # whether it was found beside a Gaussian process, and not a linear function
+    told: AtRest | None = field(default=None, repr=False)
 
-    def __getitem__(self, rows: ArrayLike) -> DryFriction:
+    def __post_init__(self) -> None:
+        each_input = np.array(self.sizes, dtype=np.float64).reshape(-1, 4).T
+        for name, values in zip(("sliding", "load", "excess", "slow"), each_input, strict=True):
+            object.__setattr__(self, name, values)  # (m,)
+
+    def model(self, model: Model) -> Model:
+        return replace(self, given=model)
+
+    def __getitem__(self, rows: ArrayLike) -> Self:
         """Return the frictions of some draws."""
         return replace(self, rest=self.rest[np.asarray(rows)])
 
-    def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
-        return self.following(x, u, lambda acting: np.zeros_like(x))
-
     def following(self, x: Array, u: Array, missed: Callable[[Array], Array]) -> Array:
-        """Return the next states ``(..., n)`` if M misses ``missed(acting inputs)``, which has their shape."""
-        reached, effects = _reached(self.model, x, u, self.change)
+        reached, effects = _reached(self.given, x, u, self.change)
         force, residuals = np.zeros_like(u), np.zeros_like(reached)
         for _ in range(self.settings.rounds):  # what is missed depends on the force, which it changes little
             force = self._force(x, u, reached + residuals, effects, force)
             residuals = missed(u - force)
         force = self._force(x, u, reached + residuals, effects, force)
-        following = geometry_of(self.model).corrected(reached, residuals, x)
+        following = self.geometry.corrected(reached, residuals, x)
         return np.asarray(following - (effects * force[..., None, :]).sum(axis=-1))
 
     def _force(self, x: Array, u: Array, reached: Array, effects: Array, force: Array) -> Array:
@@ -129,26 +157,29 @@ class DryFriction:
     def _limits(self, u: Array, before: Array, after: Array) -> Array:
         """Return the largest friction in steps with these inputs and between these rates; shapes ``(..., m)``."""
         largest = self.sliding + self.load * np.abs(u)
-        return largest + self.excess * _slowness(before, after, self.slow) if self.excess.any() else largest
+        return largest + self.excess * slowness(before, after, self.slow) if self.excess.any() else largest
 
-    def pushes(self, transitions: Transitions, missed: Callable[[Array], Array], errors: Array | None = None) -> Pushes:
-        """Return what acts on joints in transitions if M misses ``missed(acting inputs)``.
+    def pushes(
+        self, transitions: Transitions, missed: Callable[[Array, Array], Array], errors: Array | None = None
+    ) -> Pushes:
+        """Return what acts on joints in transitions if M misses ``missed(states, acting inputs)``.
 
         The errors of these forces ``(m,)`` follow from steps in which all joints move, if they are not given.
         """
         x, u, m = transitions.x, transitions.u, len(self.rates)
         before, after = x[:, self.rates], transitions.x_next[:, self.rates]
-        reached, effects = _reached(self.model, x, u, self.change)
+        reached, effects = _reached(self.given, x, u, self.change)
         of_rates, force = effects[:, self.rates, :], np.zeros_like(u)
         inverse = np.linalg.pinv(of_rates)
 
         def rates_with(forces: Array) -> Array:
-            return np.asarray((reached + missed(u - forces))[:, self.rates] - (of_rates * forces[:, None]).sum(axis=2))
+            free = (reached + missed(x, u - forces))[:, self.rates]
+            return np.asarray(free - (of_rates * forces[:, None]).sum(axis=2))
 
         for _ in range(self.settings.newton_steps):  # the frictions that these steps had
             force += (inverse * (rates_with(force) - after)[:, None]).sum(axis=2)
         if errors is None:
-            moves = _directions(transitions, self.rates, self.settings)
+            moves = _directions(transitions, self.rates, self.settings) * self.signs
             wrong = np.abs(force - self._limits(u, before, after) * moves)[(moves != 0).all(axis=1)]
             errors = self.settings.errors * np.median(wrong, axis=0)
         holding = np.repeat(force[None], m, axis=0)  # what would have kept each joint at its rate
@@ -170,16 +201,14 @@ class DryFriction:
             errors=errors,
         )
 
-    def resting(self, transitions: Transitions, pushes: Pushes) -> tuple[Array, Array, Array, Array]:
-        """Return the least and the largest friction at rest, and that of turning joints, that transitions permit.
+    def told_by(self, steps: Transitions, missed: Callable[[Array, Array], Array]) -> Self:
+        """Return the same with the least and the largest friction at rest, and that of turning joints, in some steps.
 
-        Those at rest, against pushes below and above 0, have the shape ``(2, m)``, the third one ``(m,)``. Friction
-        that depends on the place or on the time at rest holds at one force and not at a smaller one: then only larger
-        forces that set a joint in motion count for the largest one. The last array
-        is the ratio ``(2, m)`` of the two forces; it is 1 if friction may be the same everywhere.
+        Friction that depends on the place or on the time at rest holds at one force and not at a smaller one: then only
+        larger forces that set a joint in motion count for the largest one.
         """
-        m = len(self.rates)
-        least, largest = np.stack([self.sliding] * 2), np.stack([np.abs(transitions.u).max(axis=0)] * 2)
+        m, pushes = len(self.rates), self.pushes(steps, missed)
+        least, largest = np.stack([self.sliding] * 2), np.stack([np.abs(steps.u).max(axis=0)] * 2)
         passed, uneven = np.full(m, np.inf), np.ones((2, m))
         for j in range(m):
             withstood, usual = pushes.force[:, j], pushes.errors[j]
@@ -192,7 +221,14 @@ class DryFriction:
                 smallest = withstood[started].min(initial=most) + 2 * usual
                 uneven[i, j] = max(1.0, most / smallest if smallest > 0 else 1.0)
             passed[j] = withstood[pushes.turned[:, j]].min(initial=np.inf) + usual
-        return least, largest, passed, uneven
+        return replace(self, passed=passed, told=AtRest(least, largest, uneven, pushes, missed))
+
+    def between(self, shares: ArrayLike) -> Self:
+        """Return the same with friction at rest between its bounds, of which nothing else is known."""
+        assert self.told is not None
+        least, largest = self.told.least, self.told.largest
+        rest = least + np.asarray(shares)[..., None, None] * (largest - least)
+        return replace(self, rest=rest[:, None] if np.ndim(shares) else rest)
 
     def coordinates(self, transitions: Transitions) -> list[int | None]:
         """Return the state that is the integral of each rate; None if no state is."""
@@ -206,20 +242,24 @@ class DryFriction:
             found.append(int(like.argmax()) if like.max() > self.settings.integral else None)
         return found
 
-    def acting(self, transitions: Transitions) -> tuple[Transitions, Mask]:
-        """Return transitions with the inputs that act, and of which the friction is known ``(N,)``: all joints move."""
-        directions = _directions(transitions, self.rates, self.settings)
+    def teaching(self, transitions: Transitions) -> tuple[Transitions, Mask]:
+        """Return transitions with the inputs that act, and in which friction is known: all joints move."""
+        directions = _directions(transitions, self.rates, self.settings) * self.signs
         limits = self._limits(transitions.u, transitions.x[:, self.rates], transitions.x_next[:, self.rates])
         acting = transitions.u - limits * directions
         return replace(transitions, u=acting), (directions != 0).all(axis=1)
 
 
 def found_friction(
-    model: Model, transitions: Transitions, settings: FrictionSettings = FrictionSettings()
+    model: Model,
+    transitions: Transitions,
+    settings: FrictionSettings = FrictionSettings(),
+    prior: Callable[[Array, Array], CholeskyFactor] | None = None,
 ) -> DryFriction | None:
     """Return M with the friction that explains transitions best; None if friction does not explain much of them.
 
-    It is estimated beside a linear function of state and input and drag, because M may be wrong in other ways, too.
+    It is estimated beside a linear function of state and input and drag, because M may be wrong in other ways, too; or
+    beside a Gaussian process whose ``prior`` at states and inputs ``(N, N)`` is given.
     """
     x, u = transitions.x, transitions.u
     ranges = np.abs(u).max(axis=0, initial=0.0)
@@ -228,8 +268,11 @@ def found_friction(
     reached, effects = _reached(model, x, u, 1e-3 * ranges)
     strength = np.sqrt((effects**2).mean(axis=0)) / standard_deviations(transitions.x_next - x)[:, None]
     rates = strength.argmax(axis=0)
-    directions = _directions(transitions, rates, settings)
-    moving = (directions != 0).all(axis=1)
+    signs = np.where(effects.mean(axis=0)[rates, np.arange(len(rates))] < 0, -1.0, 1.0)
+    directions = _directions(transitions, rates, settings) * signs
+    moving = np.flatnonzero((directions != 0).all(axis=1))
+    if prior is not None:
+        moving = moving[:: -(-len(moving) // settings.most) or 1]
     usual = np.sqrt((transitions.x_next[:, rates] ** 2).mean(axis=0))
     fast = x[:, rates] / np.maximum(usual, 1e-300)
     plain = [np.ones(len(x)), x / standard_deviations(x)]
@@ -245,7 +288,14 @@ def found_friction(
     linear, by_state = np.linalg.qr(features)[0], np.linalg.qr(features[:, :-m])[0]
     # Under feedback with fixed gains, what inputs change cannot be told from what states do.
     known = ((_beside(by_state, inputs) ** 2).sum(axis=0) > settings.varied * (inputs**2).sum(axis=0)).all()
-    left = _beside(linear, residuals / sizes)
+    factor = None if prior is None else prior(x[moving], u[moving])
+
+    def beside(values: Array) -> Array:
+        if factor is None:
+            return _beside(linear, values)
+        return factor.whiten(values.reshape(len(values), -1)).reshape(values.shape)
+
+    left = beside(residuals / sizes)
 
     def fitted(shapes: Sequence[Array]) -> tuple[float, Array]:
         """Return what is left if friction has some shapes ``(N, m)``, and the sizes of each at each input."""
@@ -254,7 +304,7 @@ def found_friction(
             """Return forces, their sizes and what is left, if inputs change rates by ``acting`` ``(N, m, m)``."""
             forces = np.concatenate([-acting * shape[:, None, :] for shape in shapes], axis=2)
             largest, norm = scipy.optimize.nnls(
-                _beside(linear, forces / sizes[:, None]).reshape(-1, forces.shape[2]), left.ravel()
+                beside(forces / sizes[:, None]).reshape(-1, forces.shape[2]), left.ravel()
             )
             return forces, largest, float(norm)
 
@@ -268,7 +318,7 @@ def found_friction(
 
     moves = directions[moving]
     left_over, largest = fitted([moves])
-    if not left_over**2 < settings.explained * (left**2).sum():
+    if not left_over**2 < (settings.explained if factor is None else settings.explained_beside) * (left**2).sum():
         return None
     shapes = [moves, moves * np.abs(u[moving])]
     loaded, by_load = fitted(shapes)
@@ -276,25 +326,25 @@ def found_friction(
         left_over, largest = loaded, by_load
     shapes = shapes if grows else [moves]
     slow_rates = np.geomspace(settings.at_rest, settings.fast, 11).tolist()
-    slowed = {slow: fitted([*shapes, moves * _slowness(before, after, slow * usual)]) for slow in slow_rates}
+    slowed = {slow: fitted([*shapes, moves * slowness(before, after, slow * usual)]) for slow in slow_rates}
     slow = min(slowed, key=lambda each: slowed[each][0])
     if falls := slowed[slow][0] ** 2 < settings.better_shape * left_over**2:
         largest = slowed[slow][1]
     load, excess = largest[1] if grows else np.zeros(m), largest[-1] if falls else np.zeros(m)
     still = settings.held * settings.at_rest * usual
+    each_input = np.stack([largest[0], load, excess, slow * usual], axis=1)
     return DryFriction(
+        tuple(each_input.ravel().tolist()),
         model,
         rates,
-        largest[0],
-        load,
-        excess,
-        slow * usual,
+        signs,
         _creep(transitions, reached, effects, rates, still),
         1e-3 * ranges,
         still,
         rest=np.stack([largest[0] + excess] * 2),
         passed=np.full(m, np.inf),
         settings=settings,
+        beside=factor is not None,
     )
 
 
@@ -302,16 +352,6 @@ def _beside(basis: Array, values: Array) -> Array:
     """Return what is left of values ``(N, ...)`` beside the columns of an orthonormal basis ``(N, k)``."""
     flat = values.reshape(len(values), -1)
     return (flat - basis @ (basis.T @ flat)).reshape(values.shape)
-
-
-def _slowness(before: Array, after: Array, slow: Array) -> Array:
-    """Return the mean of ``exp(-(rate / slow)^2)`` over steps in which rates change evenly; all shapes ``(..., m)``."""
-    first, last = before / slow, after / slow
-    same = np.abs(last - first) < 1e-4
-    mean = (
-        0.5 * np.sqrt(np.pi) * (scipy.special.erf(last) - scipy.special.erf(first)) / np.where(same, 1.0, last - first)
-    )
-    return np.where(same, np.exp(-(first**2)), mean)
 
 
 def _creep(transitions: Transitions, reached: Array, effects: Array, rates: Rows, still: Array) -> Array:
