@@ -19,7 +19,7 @@ from ctxval.core.model import Model
 from ctxval.core.state_geometry import geometry_of
 from ctxval.core.trajectory import Transitions
 from ctxval.learning.effects.dictionary import kinds
-from ctxval.learning.effects.effect import EffectCandidate, Observed, OfInput, all_sized
+from ctxval.learning.effects.effect import EffectCandidate, Observed, OfInput, all_sized, with_one_more
 from ctxval.learning.effects.inputs import InputEffects
 from ctxval.learning.effects.plant import Plant
 from ctxval.learning.effects.transport import Delay, Late
@@ -155,13 +155,7 @@ class _Search:
 
     def longer(self, effects: Found, mode: Mode, needed: float) -> tuple[Found, Mode] | None:
         """Return effects with the one more that explains most, and their mode; None if it explains too little."""
-        kinds_of = {each.effect.kind for each in effects}
-        tried = [
-            self._ordered((*effects, each.sized(start)))
-            for each in self.candidates
-            if each.effect.kind not in kinds_of
-            for start in _starts(each)
-        ]
+        tried = [self._ordered(each) for each in with_one_more(effects, self.candidates, _starts)]
         if len(tried) > self.settings.climbed:  # those that explain most with the hyperparameters that are known
             of_tried = [self.data(each) for each in tried]
             heights = [log_posterior(mode.kernel, mode.place, _standardised(Z), E)[0] for Z, E in of_tried]

@@ -24,7 +24,7 @@ from ctxval.core.model import Model, advanced, with_memory
 from ctxval.core.state_geometry import PLAIN, StateGeometry, geometry_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.uncertain import UncertainModel
-from ctxval.learning.effects.effect import EffectCandidate
+from ctxval.learning.effects.effect import EffectCandidate, with_one_more
 from ctxval.learning.effects.model import ModelWithEffects
 from ctxval.learning.effects.uncertain import UncertainEffects
 
@@ -299,13 +299,6 @@ class _Structures:
             return self.model
         return UncertainEffects(self.model, tuple(effects), segments.commands.shape[2])
 
-    def beside(self, mode: ParameterMode) -> list[tuple[EffectCandidate, ...]]:
-        """Return the effects of a mode with each further candidate."""
-        found = _effects(mode.model)
-        kinds = [each.effect.kind for each in found]
-        return [(*found, each.sized(start)) for each in self.candidates if each.effect.kind not in kinds
-                for start in each.starts]  # fmt: skip
-
     def from_mode(self, mode: ParameterMode, effects: Sequence[EffectCandidate], steps: int) -> ParameterMode:
         """Return the mode with effects by Gauss-Newton steps that begin at one with fewer."""
         model = self.with_effects(effects, mode.segments)
@@ -316,14 +309,15 @@ class _Structures:
         """Return the mode with the effects that make executions clearly more probable, one after the other."""
         settings = self.settings
         while len(_effects(mode.model)) < settings.effects and not mode.explains:
-            tried = [self.from_mode(mode, effects, settings.screened) for effects in self.beside(mode)]
+            longer = with_one_more(_effects(mode.model), self.candidates)
+            tried = [self.from_mode(mode, effects, settings.screened) for effects in longer]
             if not tried:
                 break
             few = max(tried, key=_height)
-            longer = ParameterMode.of(few.model, mode.segments, settings, few.z)
-            if longer.height < mode.height + self.price_of(mode):
+            found = ParameterMode.of(few.model, mode.segments, settings, few.z)
+            if found.height < mode.height + self.price_of(mode):
                 break
-            mode = longer
+            mode = found
         return mode
 
     @property

@@ -54,7 +54,6 @@ class StructureSettings:
 
     inputs: PartLimits = PartLimits(3, 0.02, 0.95)  # the evidence decides
     friction: PartLimits = PartLimits(4, 0.1, 0.5)
-    friction_beside: PartLimits = PartLimits(4, 0.1, 0.95)  # beside a Gaussian process; its evidence decides
     data: PartLimits = PartLimits(3, 0.1, 1 / 3, 0.1)
     parameter: PartLimits = PartLimits(6, 0.1, 1 / 3, 0.1)
     enough: float = 0.02  # left-out error below which no further part is compared
@@ -86,10 +85,10 @@ class StructureSearch:
         names, single = len(plain.given.space.units) + 1, settings.input_effects.single
         friction = [
             Part(
-                "dry friction", limits, Costs.friction,
+                "dry friction", settings.friction, Costs.friction,
                 functools.partial(self.with_friction, beside=beside), lambda study: bool(study.within_steps), beside,
             )
-            for limits, beside in ((settings.friction, False), (settings.friction_beside, True))
+            for beside in (False, True)
         ]  # fmt: skip
         self.parts = [
             Part(
@@ -162,8 +161,9 @@ class StructureSearch:
             return before
         study = self.plain.made(given=before.given, with_data=before.with_data)
         if before.of_inputs:
-            study = self.with_inputs(study, executed, before.of_inputs) or study
-        if before.within_steps:
+            with_friction = study.made(effects=before.within_steps)
+            study = self.with_inputs(with_friction, executed, before.of_inputs) or study
+        if before.within_steps and not study.within_steps:
             study = self._with_friction_again(study, executed, before.within_steps)
         return study
 
@@ -191,7 +191,9 @@ class StructureSearch:
         plain = [] if estimated else estimated_with(InputEffects())
         # If states have to be estimated each time, or with many inputs, single ones cost too much.
         together = estimated or commanded[0].shape[-1] > self.settings.input_effects.single
-        candidates = study.input_candidates([trajectory for _, trajectory in among], together=together)
+        candidates = before  # what friction leaves in steps that teach imitates others
+        if not (before and study.within_steps):
+            candidates = study.input_candidates([trajectory for _, trajectory in among], together=together)
         with single_threaded(), np.errstate(all="ignore"):
             found = found_effects(
                 study.model, estimated_with if estimated else with_inputs, candidates, before,
@@ -202,26 +204,32 @@ class StructureSearch:
         late = study.made(effects=found)
         return self._with_friction_again(late, executed, study.within_steps) if study.within_steps else late
 
-    def _with_friction_again(self, study: DynamicsStudy, executed: Executed, before: Found) -> DynamicsStudy:
-        """Return a study with dry friction as it was found before, with sizes for these executions."""
-        beside = any(isinstance(each.effect, DryFriction) and each.effect.beside for each in before)
-        return self.with_friction(study, executed, beside) or study.made(effects=(*study.effects, *before))
-
     def with_friction(self, study: DynamicsStudy, executed: Executed, beside: bool = False) -> DynamicsStudy | None:
         """Return a study with the dry friction that executions show, which may be hidden beside what M misses."""
+        found = self._friction(study, executed, beside)
+        study = study.made(effects=(*study.of_inputs, *found))
+        # Effects of inputs that were found without friction have sizes that make up for it.
+        late = self.with_inputs(study, executed, study.of_inputs) if found and study.of_inputs else None
+        return late or (study if found else None)
+
+    def _with_friction_again(self, study: DynamicsStudy, executed: Executed, before: Found) -> DynamicsStudy:
+        """Return a study with dry friction as it was found before, with sizes for these executions."""
+        known = any(isinstance(each.effect, DryFriction) and each.effect.beside for each in before)
+        ways = (self._friction(study, executed, beside) for beside in (known, True))
+        return study.made(effects=(*study.effects, *next(filter(None, ways), before)))
+
+    def _friction(self, study: DynamicsStudy, executed: Executed, beside: bool) -> Found:
         extended, model = study.extended.executions(executed), before_refinement(study.validation.model)
         recorded = study.transitions_of(extended, with_data=False) if extended else None
         learned = study.made(effects=study.of_inputs).learned_alone(executed) if beside else None
         if recorded is None or (beside and learned is None):
-            return None
-        friction, settings = None, self.settings.dry_friction
+            return ()
         prior = None if learned is None else learned.posterior.prior
         # Least squares may fail, and so may the factor of a covariance.
         with single_threaded(), np.errstate(all="ignore"), contextlib.suppress(RuntimeError, InputError):
-            friction = found_friction(model, recorded[0], settings, prior)
-        if friction is None:
-            return None
-        return study.made(effects=(*study.of_inputs, EffectCandidate(friction)))
+            friction = found_friction(model, recorded[0], self.settings.dry_friction, prior)
+            return () if friction is None else (EffectCandidate(friction),)
+        return ()
 
 
 def _without_data(study: DynamicsStudy, executed: Executed) -> DynamicsStudy | None:

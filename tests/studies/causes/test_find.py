@@ -23,9 +23,11 @@ from ctxval import (
     searches,
     systems,
 )
+from ctxval.campaign.history import at_points, executed_trials
 from ctxval.core.controller import Controller
 from ctxval.core.model import Step
 from ctxval.errors import InputError
+from ctxval.learning import DynamicsStudy
 from ctxval.studies import causes
 from ctxval.studies.causes import CauseReport, find_causes
 from facts import assert_names, refuses
@@ -82,6 +84,18 @@ def test_dry_friction_and_a_delay_are_found_together() -> None:
     assert_names(report.sentence, 35)
     assert report.after is not None
     assert report.after < 0.1 * report.before
+
+
+@pytest.mark.slow
+def test_a_verdict_and_its_explanation_have_one_friction_and_one_delay() -> None:
+    executed = campaign(slide(friction), delay=2).run(6)
+    runs = at_points(executed_trials(executed.store, executed.trials))
+    learned = DynamicsStudy(executed.validation).learn(runs)
+    assert learned is not None
+    sizes = {cause.name: cause.sizes for cause in find_causes(executed).causes}
+    assert sizes.keys() == {"delay", "Coulomb friction"}
+    assert learned.acting["delay [steps]"] == pytest.approx(sizes["delay"][0], rel=0.02)
+    assert learned.friction["force [N]"] == pytest.approx(sizes["Coulomb friction"][0], rel=0.02)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ act for those that are commanded, the next state, or what is recorded of a state
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -164,6 +164,17 @@ def all_sized(candidates: Iterable[EffectCandidate], sizes: Iterable[Size]) -> t
     """Return candidates with effects of these sizes, one for each parameter of all of them in their order."""
     left = iter(sizes)
     return tuple(each.sized([next(left) for _ in each.parameters]) for each in candidates)
+
+
+def with_one_more(
+    effects: tuple[EffectCandidate, ...],
+    candidates: Iterable[EffectCandidate],
+    starts: Callable[[EffectCandidate], Iterable[tuple[float, ...]]] = lambda candidate: candidate.starts,
+) -> list[tuple[EffectCandidate, ...]]:
+    """Return effects with one more of another kind, at each of its first guesses."""
+    kinds = [each.effect.kind for each in effects]
+    others = (each for each in candidates if each.effect.kind not in kinds)
+    return [(*effects, each.sized(start)) for each in others for start in starts(each)]
 
 
 def of_size(effect: Effect, parameter: Parameter, *starts: float) -> EffectCandidate:

@@ -28,6 +28,7 @@ class CauseSettings:
     steps: int = 5  # of a failed execution
     # Prior deviations from M, and deviations of the posterior, by which an uncertain parameter of M must differ
     differs: tuple[float, float] = (0.02, 3.0)
+    shares: tuple[float, ...] = (1.0, 0.5, 0.25, 0.12, 0.06)  # of a search, the largest that fits into a budget
 
     def part(self, share: float) -> CauseSettings:
         """Return the settings of a search that costs about so much of this one."""
@@ -91,7 +92,7 @@ def fitting_settings(ledger: Ledger, settings: CauseSettings) -> CauseSettings:
     """
     if ledger.costs is None:
         return settings
-    for share in ledger.costs.thinking.settings.shares:
+    for share in settings.shares:
         part = settings if share == 1 else settings.part(share)
         needed = CauseCosts(ledger.costs, part).first()
         if ledger.fits("causes", lambda _, needed=needed: needed):  # type: ignore[misc]
