@@ -88,7 +88,7 @@ def _ridge(count: int) -> tuple[models.Parametric, list[Trajectory]]:
     return model, runs
 
 
-@pytest.mark.parametrize("count", [2, 3, 4])
+@pytest.mark.parametrize("count", [2, 4])
 def test_parameters_of_which_executions_tell_the_product_alone_stay_uncertain(count: int) -> None:
     model, runs = _ridge(count)
     segments = Segments.of(model, runs, np.random.default_rng(0), ParameterSettings())
@@ -106,8 +106,8 @@ def test_parameters_that_are_known_very_unequally_have_samples() -> None:
     segments = Segments.of(model, runs, np.random.default_rng(0), ParameterSettings())
     assert segments is not None
     mode = ParameterMode.of(model, segments, ParameterSettings())
-    turned = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
-    precision = turned * [1.0, 1.0, 1e6, 1e10] @ turned.T
+    turned = np.linalg.qr(np.random.default_rng(1).normal(size=(4, 4)))[0]
+    precision = turned * [1.0, 1.0, 1e9, 3e10] @ turned.T
     posterior = replace(mode, precision=precision).posterior(np.random.default_rng(1))
     assert np.isfinite(posterior.samples).all()
 

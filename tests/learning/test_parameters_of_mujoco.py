@@ -13,7 +13,7 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.learning.effects import SharedAttribute
 from ctxval.learning.effects.mujoco import further_attributes
 from ctxval.learning.effects.uncertain import UncertainEffects
-from ctxval.learning.parameter_posterior import ParameterMode, ParameterSettings, most_probable
+from ctxval.learning.parameter_posterior import Known, ParameterMode, ParameterSettings, most_probable
 
 pytest.importorskip("mujoco")
 
@@ -117,3 +117,21 @@ def test_a_shift_of_a_centre_of_mass_is_found_with_the_friction_of_contacts() ->
     assert isinstance(mode.model, UncertainEffects)
     assert [vars(each.effect)["parameter"] for each in mode.model.effects] == ["centre_x[box]"]
     assert values(mode) == pytest.approx({"friction": 0.85, "mass[box]": 1.0, "centre of mass": 0.012}, rel=0.01)
+
+
+def test_what_fewer_executions_told_is_where_the_next_fit_begins() -> None:
+    model = models.MuJoCo(BOX, dt=DT, uncertain={"friction": "20 %", "mass[box]": "20 %"})
+
+    def change(compiled: Any) -> None:
+        compiled.geom_friction[:, 0] *= 0.85
+        compiled.body("box").mass *= 1.2
+        compiled.body("box").inertia *= 1.2
+
+    rng, known = np.random.default_rng(0), Known(np.log([0.851, 1.2]) / 0.2)
+    # Nothing else is afforded, and Gauss-Newton steps from the prior's mean end elsewhere.
+    runs = pushed(model.changed(change))
+    alone, near = (most_probable(model, runs, (), each, rng, SETTINGS, lambda steps: False) for each in (None, known))
+    assert alone is not None
+    assert near is not None
+    assert near.left < 1e-3 < alone.left
+    assert values(near) == pytest.approx({"friction": 0.85, "mass[box]": 1.2}, rel=0.01)

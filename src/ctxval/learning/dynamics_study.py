@@ -36,6 +36,7 @@ from ctxval.learning.input_effects import Found, input_candidates
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import NoiseSettings, NoiseStudy
 from ctxval.learning.noisy_draws import NoisyPosterior
+from ctxval.learning.parameter_posterior import Known
 from ctxval.learning.parametric_dynamics import ParametricDynamics, ParametricSettings, learned_parameters
 from ctxval.learning.precision import AgreeingDynamics, agreeing_posterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
@@ -103,7 +104,7 @@ class DynamicsStudy(ShortRepr):
         self.planner = LoopPlanner(self.validation, of_inputs)
         self._errors = ErrorVectors(LoopPlanner(validation) if validation.outputs.hide_states else self.planner)
         self._covariances = Latest[bytes, LearnedCovariances | None](8)
-        self._effects_of = Latest[bytes, Found](8)
+        self._known_of = Latest[bytes, Known | None](8)
         self._made = Latest[tuple[object, ...], DynamicsStudy](8)
         self._searches: dict[float, WorstCaseSearch] = {}
         #: largest distances of tasks if M errs by so much in each step, of each error and task
@@ -237,14 +238,14 @@ class DynamicsStudy(ShortRepr):
         def affords(steps: int) -> bool:
             return ledger.optional("learning", "parameters of M from all of their prior", lambda c: c.steps(steps))
 
-        if key not in self._effects_of:
+        if key not in self._known_of:
             candidates = self.input_candidates(loops, together=True) + further_attributes(model, loops)
             posterior = learned_parameters(
                 model, loops[:count], on_model, seed, candidates, None, settings.parametric, affords
             )
-            self._effects_of[key] = () if posterior is None else posterior.effects
-        if posterior is None or count < len(loops):
-            seed, known = (self.seed, len(loops), 0), self._effects_of[key]
+            self._known_of[key] = None if posterior is None else posterior.known
+        if (known := self._known_of[key]) is not None and (posterior is None or count < len(loops)):
+            seed = self.seed, len(loops), 0
             posterior = learned_parameters(model, loops, on_model, seed, (), known, settings.parametric, affords)
         if posterior is None:
             return None

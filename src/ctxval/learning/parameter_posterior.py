@@ -245,7 +245,7 @@ class ParameterMode(ShortRepr):
                 [(np.linalg.solve(at, (samples - middle).T) ** 2).sum(axis=0) for middle, at in proposals]
             )
             volumes = np.array([np.log(np.diag(at)).sum() for _, at in proposals])
-            of_proposals = -0.5 * (nu + K) * np.log1p(squares / nu) - volumes[:, None]
+            of_proposals = -0.5 * (nu + K) * np.log1p(np.array(each) / nu) - volumes[:, None]
             logs = heights - np.logaddexp.reduce(of_proposals, axis=0)
             weights = np.exp(logs - logs.max())
             weights /= weights.sum()
@@ -263,6 +263,14 @@ class ParameterMode(ShortRepr):
         row = int(at_mean <= at_mode + settings.curved)
         left = replace(self, here=of_middle[row]).left
         return ParameterPosterior(self.model, middle[row], covariance, samples, weights, left, settings)
+
+
+@dataclass(frozen=True, eq=False)
+class Known(ShortRepr):
+    """What fewer executions told: standardised parameters of a model, and effects with their sizes."""
+
+    parameters: Array  # (K,)
+    effects: tuple[EffectCandidate, ...] = ()
 
 
 class CrossEntropySearch:
@@ -323,6 +331,19 @@ class _Structures:
         begun = np.append(mode.z, np.zeros(len(model.uncertain) - len(mode.z)))
         return ParameterMode.of(model, mode.segments, self.settings, begun, steps)
 
+    def from_known(self, segments: Segments, known: Known | None) -> ParameterMode:
+        """Return the mode by Gauss-Newton steps that begin at what is known, or if this explains too little, at M."""
+        settings = self.settings
+        if known is None:
+            return ParameterMode.of(self.model, segments, settings)
+        model = self.with_effects(known.effects, segments)
+        begun = np.append(known.parameters, np.zeros(len(model.uncertain) - len(known.parameters)))
+        mode = ParameterMode.of(model, segments, settings, begun)
+        if mode.explains:
+            return mode
+        alone = ParameterMode.of(self.model, segments, settings)
+        return min(mode, self.from_mode(alone, known.effects, settings.newton), key=lambda each: each.left)
+
     def greedily(self, mode: ParameterMode) -> ParameterMode:
         """Return the mode with the effects that make executions clearly more probable, one after the other."""
         settings = self.settings
@@ -376,7 +397,7 @@ def most_probable(
     model: UncertainModel,
     executed: Sequence[Trajectory],
     candidates: Sequence[EffectCandidate],
-    known: Sequence[EffectCandidate] | None,
+    known: Known | None,
     rng: np.random.Generator,
     settings: ParameterSettings,
     affords: Callable[[int], bool] = lambda steps: True,
@@ -384,16 +405,14 @@ def most_probable(
     """Return the mode of parameters and effects; None without segments.
 
     Effects are looked for among candidates, or are the ``known`` ones, whose sizes are fitted again. Gauss-Newton steps
-    begin at the prior's mean. If they explain too little, the mode of single steps, of which more are without a change
-    of contacts, is looked for from all of the prior: of the parameters, then with each effect, if so many steps of the
-    model can be afforded.
+    begin at what is known, then at the prior's mean. If they explain too little, the mode of single steps, of which
+    more are without a change of contacts, is looked for from all of the prior: of the parameters, then with each
+    effect, if so many steps of the model can be afforded.
     """
     segments, structures = Segments.of(model, executed, rng, settings), _Structures(model, candidates, settings)
     if segments is None:
         return None
-    mode = ParameterMode.of(model, segments, settings)
-    if known:
-        mode = structures.from_mode(mode, known, settings.newton)
+    mode = structures.from_known(segments, known)
     short = None if mode.explains else Segments.of(model, executed, rng, replace(settings, steps=1))
     if short is None:
         return mode

@@ -23,11 +23,13 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.uncertain import UncertainModel
 from ctxval.learning.draws import DrawsWithoutNoise
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
+from ctxval.learning.effects.effect import all_sized
 from ctxval.learning.effects.uncertain import UncertainEffects
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.input_effects import Found
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.parameter_posterior import (
+    Known,
     ParameterPosterior,
     ParameterSettings,
     blocks_of,
@@ -183,10 +185,14 @@ class ParametricPosterior(ShortRepr):
     noise: ClassVar[float] = 0.0  # rests are a part of draws
 
     @property
-    def effects(self) -> Found:
-        """The effects of inputs beside the parameters."""
-        model = self.parameters.model
-        return model.effects if isinstance(model, UncertainEffects) else ()
+    def known(self) -> Known:
+        """The most probable parameters of M, and the effects of inputs beside them."""
+        model, mean = self.parameters.model, self.parameters.mean
+        if not isinstance(model, UncertainEffects):
+            return Known(mean)
+        sizes = [float(each.at(z)) for each, z in zip(model.uncertain, mean, strict=True)]
+        count = len(model.given.uncertain)
+        return Known(mean[:count], all_sized(model.effects, sizes[count:]))
 
     def functions_for(self, draws: int) -> int:
         """Return how many times the usual number of draws gives at least so many."""
@@ -301,7 +307,7 @@ def learned_parameters(
     loops: Trajectory,
     seed: tuple[int, ...],
     candidates: Found = (),
-    known: Found | None = None,
+    known: Known | None = None,
     settings: ParametricSettings = ParametricSettings(),
     affords: Callable[[int], bool] = lambda steps: True,
 ) -> ParametricPosterior | None:

@@ -54,7 +54,6 @@ class StructureSettings:
 
     inputs: PartLimits = PartLimits(3, 0.02, 0.95)  # the evidence decides
     friction: PartLimits = PartLimits(4, 0.1, 0.5)
-    friction_beside: PartLimits = PartLimits(4, 0.1, 0.95)  # beside a Gaussian process; its evidence decides
     data: PartLimits = PartLimits(3, 0.1, 1 / 3, 0.1)
     parameter: PartLimits = PartLimits(6, 0.1, 1 / 3, 0.1)
     enough: float = 0.02  # left-out error below which no further part is compared
@@ -86,10 +85,10 @@ class StructureSearch:
         names, single = len(plain.given.space.units) + 1, settings.input_effects.single
         friction = [
             Part(
-                "dry friction", limits, Costs.friction,
+                "dry friction", settings.friction, Costs.friction,
                 functools.partial(self.with_friction, beside=beside), lambda study: bool(study.within_steps), beside,
             )
-            for limits, beside in ((settings.friction, False), (settings.friction_beside, True))
+            for beside in (False, True)
         ]  # fmt: skip
         self.parts = [
             Part(

@@ -17,6 +17,7 @@ from ctxval._util.arrays import Array
 from ctxval.core.target import Largest
 from ctxval.core.trajectory import Transitions
 from ctxval.learning import DynamicsStudy
+from ctxval.learning.dynamics_posterior import learn_posterior
 from ctxval.learning.effects import Delay, ModelWithEffects
 from ctxval.learning.effects.dry_friction import DryFriction, found_friction
 from facts import assert_names
@@ -122,6 +123,16 @@ def test_its_size_is_in_units_of_the_input_if_the_model_errs_in_what_an_input_do
     friction = found_friction(weak, recorded(sticky_step))
     assert friction is not None
     assert friction.sliding[0] == pytest.approx(GRIP, rel=0.02)
+
+
+def test_friction_that_is_hidden_beside_another_error_is_found_beside_its_gaussian_process() -> None:
+    steps = recorded(lambda x, u: sticky_step(x, u + 2 * np.sin(2 * x[..., :1]), 0.3))
+    posterior = learn_posterior(MODEL, steps, np.zeros(len(steps), dtype=np.intp))
+    assert posterior is not None
+    assert found_friction(MODEL, steps) is None
+    friction = found_friction(MODEL, steps, prior=posterior.prior)
+    assert friction is not None
+    assert friction.sliding[0] == pytest.approx(0.3, rel=0.05)
 
 
 def test_it_is_found_at_an_input_that_drives_its_joint_backwards() -> None:
