@@ -234,18 +234,16 @@ class ParameterMode(ShortRepr):
         mean, covariance = self.z, np.asarray(vectors / values @ vectors.T, dtype=np.float64)
         samples, heights, proposals = np.empty((0, K)), np.empty(0), list[tuple[Array, Array]]()
         for _ in range(settings.rounds):
-            root = np.linalg.cholesky(settings.wider * covariance + 1e-12 * np.eye(K))
+            root = np.asarray(np.linalg.cholesky(settings.wider * covariance + 1e-12 * np.eye(K)), dtype=np.float64)
             proposals.append((mean, root))
             scale = np.sqrt(rng.chisquare(nu, (settings.samples, 1)) / nu)
             new = mean + rng.standard_normal((settings.samples, K)) / scale @ root.T
             samples = np.concatenate([samples, new])
             heights = np.concatenate([heights, -self.surprise(self.squares(new), new, self.variance)])
             # All samples together are from the mixture of all proposals.
-            squares = np.array(
-                [(np.linalg.solve(at, (samples - middle).T) ** 2).sum(axis=0) for middle, at in proposals]
-            )
+            squares = [(np.linalg.solve(at, (samples - middle).T) ** 2).sum(axis=0) for middle, at in proposals]
             volumes = np.array([np.log(np.diag(at)).sum() for _, at in proposals])
-            of_proposals = -0.5 * (nu + K) * np.log1p(np.array(each) / nu) - volumes[:, None]
+            of_proposals = -0.5 * (nu + K) * np.log1p(np.array(squares) / nu) - volumes[:, None]
             logs = heights - np.logaddexp.reduce(of_proposals, axis=0)
             weights = np.exp(logs - logs.max())
             weights /= weights.sum()
