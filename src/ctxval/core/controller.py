@@ -222,9 +222,8 @@ def _ends(limits: Any) -> tuple[ArrayLike, ArrayLike]:
     spellings = "write rows [[low, high], ...], one for each input, or one number h for [-h, h] of every input"
     if isinstance(limits, Mapping):
         with suppress(KeyError, ValueError, InputError):  # other tables
-            ends = [np.atleast_1d(as_floats(name, limits[name])) for name in ("low", "high")]
-            rows = [list(row) for row in zip(*(end.tolist() for end in np.broadcast_arrays(*ends)), strict=True)]
-            spellings = f"write limits = {rows}"
+            ends = np.broadcast_arrays(*(np.atleast_1d(as_floats(name, limits[name])) for name in ("low", "high")))
+            spellings = f"write limits = {np.stack(ends, axis=1).tolist()}" if ends[0].ndim == 1 else spellings
         raise InputError(f"limits must not be a table, got {dict(limits)}: {spellings}.")
     try:
         array = as_floats("limits", limits)
