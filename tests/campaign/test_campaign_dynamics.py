@@ -95,3 +95,17 @@ def test_a_result_that_was_replaced_teaches_what_replaced_it() -> None:
     x_next = after.posterior.data.transitions.x_next
     assert np.isin(right.states[1:], x_next).all()
     assert not np.isin(right.states[1:], before.posterior.data.transitions.x_next).all()
+
+
+def test_an_undecided_verdict_says_that_learning_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    campaign = Campaign(make_validation(), search=searches.Random(), seed=3).run(3)
+    threshold = 2 * max(trial.distance or 0.0 for trial in campaign.trials)
+    assert "failed" not in campaign.verdict(threshold).reason
+
+    def fail(*_: object) -> None:
+        raise NameError("undefined_in_a_part")
+
+    monkeypatch.setattr(campaign.validation.model, "step", fail)
+    verdict = campaign.verdict(threshold)
+    assert verdict.answer == "undecided"
+    assert "undefined_in_a_part" in verdict.reason

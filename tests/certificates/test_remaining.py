@@ -89,6 +89,17 @@ def test_what_withdraws_the_bound(trials: list[Trial], beyond: float, code: str 
     assert verdict.certificate.details["not_executed"] == 16
 
 
+def test_tests_alone_show_how_many_tasks_may_exceed_the_largest_of_them() -> None:
+    remaining, misses = left(executed()), []
+    count = remaining.missed_by_tests(0.95)
+    tasks, before, rng = 40, 24 - 8, np.random.default_rng(3)
+    for k in (count, count + 1):  # tasks that exceed, among those that are not executed before the tests
+        drawn = np.argsort(rng.random((20_000, tasks - before)), axis=1)[:, :8]
+        misses.append(float((drawn >= k).all(axis=1).mean()))
+    assert misses[0] > 0.05 > misses[1]
+    assert left(executed(12, drawn=0)).missed_by_tests(0.95) == 28
+
+
 def test_a_law_needs_executions_numbers_and_positive_distances() -> None:
     assert left(executed(10, drawn=0)).can_be_bounded
     assert not left(executed(9, drawn=0)).can_be_bounded

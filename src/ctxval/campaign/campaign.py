@@ -615,6 +615,11 @@ class Campaign:
                     by_distances = judge(recorder.trials, threshold, options, known)
                     undecided = by_distances.answer == "undecided" and by_distances.certificate is None
                     verdict = verdict if undecided else by_distances
+            failure = (recorder.dynamics.failure or "").rstrip(".")
+            if verdict.answer == "undecided" and failure and failure not in verdict.reason:
+                verdict = replaced(
+                    verdict, reason=f"{verdict.reason.rstrip('.')}; learning the dynamics failed: {failure}."
+                )
             return with_next_task(verdict, recorder, options), known
 
     @checked

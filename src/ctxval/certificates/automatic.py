@@ -85,6 +85,7 @@ class WholeSuite(CertificateKind):
             "freedom": left.law.freedom,
             "beyond_the_records": float(left.beyond.max()),
             "evidence_against": left.against,
+            "missed_by_tests": left.missed_by_tests(confidence),
             "tests": {"drawn": len(left.drawn), "share_missed": None, "largest_error": None},
         }
         return self.certificate(

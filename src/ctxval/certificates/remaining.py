@@ -122,6 +122,17 @@ class RemainingTasks(ShortRepr):
         """The rows of the trials whose tasks were drawn."""
         return [row for row, origin in enumerate(self.sample.origins) if origin in DRAWN]
 
+    def missed_by_tests(self, confidence: float) -> int:
+        """Return how many of the tasks that are left may exceed what no drawn task exceeded, whatever their law is.
+
+        Each was drawn at random among those that were left then, so all K are missed with the probability
+        ``prod (1 - K / n)`` of the numbers n that were left.
+        """
+        executed = [len(np.unique(self._same[:, :row].argmax(axis=0))) for row in self.drawn]
+        left, count = len(self.sample.members) - np.array(executed, dtype=np.float64), len(self.rows)
+        missed = [k for k in range(1, count + 1) if np.prod(1 - k / np.maximum(left, k)) > 1 - confidence]
+        return len(missed)
+
     @cached_property
     def against(self) -> float:
         """The evidence of the drawn tasks against the law of the executions before each.

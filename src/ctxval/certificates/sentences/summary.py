@@ -48,4 +48,8 @@ def rows(verdict: Verdict, units: str = "") -> dict[str, str]:
         shown["without assumptions"] = (
             f"at most {at_most(100 * missed, 2)} % of the {certificate.target.drawn} exceed it ({level})"
         )
+    if (number := details.get("missed_by_tests")) is not None:
+        shown["without assumptions"] = (
+            f"at most {number} of the {details['not_executed']} other tasks exceed it ({level})"
+        )
     return shown

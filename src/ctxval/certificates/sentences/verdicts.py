@@ -219,15 +219,21 @@ def rests_on(conditions: Sequence[str], certificate: Certificate, tau: float, kn
     """Return the evidence of a validation, what it rests on, and what independent draws say without any of it."""
     tests = certificate.details.get("tests", {})
     text = f"{_evidence(certificate, tau, known.quantities)}It rests on {'; on '.join(conditions)}."
+    alone = (
+        f"Without these assumptions, the tests alone show with {percent(certificate.confidence)} confidence only that"
+    )
+    limit = known.quantities.of(f"{tau:.6g}")
+    if (missed := certificate.details.get("missed_by_tests")) is not None:
+        left = counted(certificate.details["not_executed"], "task")
+        return f"{text} {alone} at most {missed} of the {left} that were not executed exceed {limit}."
     if tests.get("share_missed") is None:
         return text
     what = f"of the {certificate.target.drawn} {of_tasks(certificate.distribution)}".removeprefix("of the tasks ")
     draws = [f"{counted(tests['spread'], 'test')} drawn as a Latin hypercube"] if tests["spread"] else []
     draws += [counted(tests["independent"], "independent draw")] if tests["independent"] else []
     return (
-        f"{text} Without these assumptions, the tests alone show with {percent(certificate.confidence)} confidence "
-        f"only that at most {at_most(100 * tests['share_missed'], 2)} % {what} exceed "
-        f"{known.quantities.of(f'{tau:.6g}')} ({' and '.join(draws)})."
+        f"{text} {alone} at most {at_most(100 * tests['share_missed'], 2)} % {what} exceed {limit} "
+        f"({' and '.join(draws)})."
     )
 
 
