@@ -376,7 +376,7 @@ def _trial(campaign: Campaign, trial: Any) -> dict[str, Any]:
     """Return a trial in plain values, with the trajectory that was executed."""
     executed = campaign.trajectories(trial)[1]
     names = "number origin state parameters attempts executed distance failure note because"
-    values = {name: getattr(trial, name) for name in names.split()}
+    values = {name: getattr(trial, name) for name in names.split()} | {"note": trial.note.to_json()}
     run = None
     if executed is not None:
         run = {name: getattr(executed, name).tolist() for name in ("times", "states", "inputs")}

@@ -11,7 +11,7 @@ BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
 import frozen_replay  # noqa: E402
-from freeze import FROZEN, path_of, read, recipes, write  # noqa: E402
+from freeze import FROZEN, frozen_campaign, path_of, read, recipes, write  # noqa: E402
 
 SAMPLE = (
     "strangers/salt-bath 0 0.95",
@@ -60,3 +60,10 @@ def test_numbers_agree_up_to_a_millionth() -> None:
     assert frozen_replay.same({"a": [1.0, None]}, {"a": [1.0000005, None]})
     assert not frozen_replay.same({"a": [1.0, None]}, {"a": [1.000005, None]})
     assert not frozen_replay.same(1.0, None)
+
+
+@pytest.mark.in_full
+def test_a_campaign_that_is_frozen_now_replays(tmp_path: Path) -> None:
+    (recipe,) = [one for one in recipes() if one.name == "paper/linear-1 0 1.05"]
+    write(tmp_path / "now.json.xz", frozen_campaign(recipe))
+    assert frozen_replay.replay(tmp_path / "now.json.xz")["differs"] == []
