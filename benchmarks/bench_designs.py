@@ -124,7 +124,7 @@ def suggestion_seconds(limits: object) -> float:
         return seconds(lambda: campaign.run(budget=2), repeats=1)
 
 
-LIMITS = {"low": 0.0, "high": 6.0}
+LIMITS = [[0.0, 6.0], [0.0, 6.0]]
 FIGURES: dict[str, Callable[[], float]] = {
     **{f"quadrotor, {n} tasks": lambda n=n: design_seconds(quadrotor(None), n) for n in (8, 16, 64)},
     **{f"quadrotor with limits, {n} tasks": lambda n=n: design_seconds(quadrotor(LIMITS), n) for n in (8, 64)},

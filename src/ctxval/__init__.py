@@ -50,8 +50,9 @@ if TYPE_CHECKING:
     from ctxval.studies import refinement as refinement
     from ctxval.studies import replay as replay
     from ctxval.studies import safety as safety
-    from ctxval.studies.comparison import Comparison, compare
-    from ctxval.studies.refinement import refine
+    from ctxval.studies.comparison.compare import compare
+    from ctxval.studies.comparison.result import Comparison
+    from ctxval.studies.refinement.refine import refine
 
 __version__ = VERSION
 
