@@ -99,7 +99,7 @@ _MODULES = {
 _LAZY = {
     "Array": "_util.arrays",
     "Campaign": "campaign.campaign",
-    "Comparison": "studies.comparison",
+    "Comparison": "studies.comparison.result",
     "Experiment": "core.experiment",
     "Labels": "core.labels",
     "Normal": "core.task_distribution",
@@ -119,11 +119,11 @@ _LAZY = {
     "Verdict": "certificates.verdict",
     "Watch": "campaign.watching",
     "cached_truth": "core.truth",
-    "compare": "studies.comparison",
+    "compare": "studies.comparison.compare",
     "grid_truth": "core.truth",
     "load_experiment": "cli.config.settings",
     "part": "_util.registry",
-    "refine": "studies.refinement",
+    "refine": "studies.refinement.refine",
     "rollout": "core.rollout",
     "search_truth": "core.truth",
 }
