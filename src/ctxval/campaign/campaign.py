@@ -326,8 +326,7 @@ class Campaign:
     ) -> Campaign:
         """Execute independent draws from the distribution of tasks until the trials contain this number of them.
 
-        The number of draws includes earlier ones. The other arguments and the errors raised are those of :meth:`run`;
-        a CertificateError is raised if people are executing open trials.
+        The number of draws includes earlier ones. The other arguments and errors are those of :meth:`run`.
 
         Raises:
             CertificateError: if people are executing open trials.

@@ -323,7 +323,7 @@ class WatchState(ShortRepr):
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
-        """Return the state that :meth:`to_json` returned; an InputError if these are not its values.
+        """Return the state that :meth:`to_json` returned.
 
         Raises:
             InputError: if it is not what ``to_json`` returned.

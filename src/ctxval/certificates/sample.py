@@ -143,7 +143,7 @@ class Sample(ShortRepr):
 
     @property
     def members(self) -> Array:
-        """The tasks of the suite, points of the unit cube ``(N, d)``; a CertificateError is raised without one.
+        """The tasks of the suite, points of the unit cube ``(N, d)``.
 
         Raises:
             CertificateError: if tasks fill a box.

@@ -210,11 +210,12 @@ class Validation:
         """Return a trajectory that is a complete and finite execution of a plan; refuse any other.
 
         If the closed loops of both M and S ended early, by a fall or an instability, or that of S at a fall that the
-        synthesizer knows, it is the steps before. If only one of them did otherwise, there is no distance. An
-        InputError says that it belongs to another task. A start tolerance replaces that of this validation.
+        synthesizer knows, it is the steps before. If only one of them did otherwise, there is no distance. A start
+        tolerance replaces that of this validation.
 
         Raises:
-            ExecutionError: if the result is no trajectory of the task.
+            ExecutionError: if the result is no complete and finite trajectory of the task.
+            InputError: if it belongs to another task.
         """
         tolerance = self.start_tolerance if start_tolerance is None else start_tolerance
         if not isinstance(trajectory, Trajectory):

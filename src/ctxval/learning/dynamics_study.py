@@ -36,7 +36,7 @@ from ctxval.learning.input_effects import Found, input_candidates
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import NoiseSettings, NoiseStudy
 from ctxval.learning.noisy_draws import NoisyPosterior
-from ctxval.learning.parameter_posterior import Known
+from ctxval.learning.parameter_posterior import PRIOR_SEARCH, Known
 from ctxval.learning.parametric_dynamics import ParametricDynamics, ParametricSettings, learned_parameters
 from ctxval.learning.precision import AgreeingDynamics, agreeing_posterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
@@ -96,7 +96,7 @@ class DynamicsStudy(ShortRepr):
         self.given, self.seed, self.target = validation, seed, target
         self.effects, self.with_data = effects, with_data
         self.within_steps = tuple(each for each in effects if isinstance(each.effect, SettlingModel))
-        self.of_inputs = tuple(each for each in effects if each not in self.within_steps)
+        self.of_inputs = tuple(each for each in effects if not isinstance(each.effect, SettlingModel))
         of_inputs = _with_effects(validation.model, effects).of_inputs
         self.extended = ExtendedValidation(validation, of_inputs) if extended is None else extended
         self.validation = self.extended.validation
@@ -236,7 +236,7 @@ class DynamicsStudy(ShortRepr):
         posterior, seed = None, (self.seed, count, 0)
 
         def affords(steps: int) -> bool:
-            return ledger.optional("learning", "parameters of M from all of their prior", lambda c: c.steps(steps))
+            return ledger.optional("learning", PRIOR_SEARCH, lambda costs: costs.steps(steps))
 
         if key not in self._known_of:
             candidates = self.input_candidates(loops, together=True) + further_attributes(model, loops)

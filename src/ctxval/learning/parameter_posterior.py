@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from typing import Self
 
 import numpy as np
@@ -255,7 +256,7 @@ class ParameterMode(ShortRepr):
             if effective >= settings.effective:
                 break
         middle = np.stack([self.z, mean])
-        of_middle = self.squares(middle)
+        of_middle = np.stack([self.here, self.squares(mean[None])[0]])
         # The mean of a curved posterior lies beside it.
         at_mode, at_mean = self.surprise(of_middle, middle, self.variance)
         row = int(at_mean <= at_mode + settings.curved)
@@ -269,6 +270,10 @@ class Known(ShortRepr):
 
     parameters: Array  # (K,)
     effects: tuple[EffectCandidate, ...] = ()
+
+
+PRIOR_SEARCH = "parameters of M from all of their prior"
+"""The name of this stage in a budget of thinking."""
 
 
 class CrossEntropySearch:
@@ -303,9 +308,8 @@ class CrossEntropySearch:
             self._covariance = wider * (spread * weights[:, None]).T @ spread + before * self._covariance
         return self
 
-    @property
-    def mode(self) -> ParameterMode:
-        """The mode by Gauss-Newton steps from the best sample."""
+    def refined(self) -> ParameterMode:
+        """Return the mode by Gauss-Newton steps from the best sample."""
         origin = self.origin
         return ParameterMode.of(origin.model, origin.segments, origin.settings, self.z)
 
@@ -323,34 +327,33 @@ class _Structures:
             return self.model
         return UncertainEffects(self.model, tuple(effects), segments.commands.shape[2])
 
-    def from_mode(self, mode: ParameterMode, effects: Sequence[EffectCandidate], steps: int) -> ParameterMode:
-        """Return the mode with effects by Gauss-Newton steps that begin at one with fewer."""
-        model = self.with_effects(effects, mode.segments)
-        begun = np.append(mode.z, np.zeros(len(model.uncertain) - len(mode.z)))
-        return ParameterMode.of(model, mode.segments, self.settings, begun, steps)
+    def fitted(
+        self, segments: Segments, begun: Array, effects: Sequence[EffectCandidate] = (), steps: int | None = None
+    ) -> ParameterMode:
+        """Return the mode with effects by Gauss-Newton steps from parameters, and usual sizes of further effects."""
+        model = self.with_effects(effects, segments)
+        begun = np.append(begun, np.zeros(len(model.uncertain) - len(begun)))
+        return ParameterMode.of(model, segments, self.settings, begun, steps)
 
     def from_known(self, segments: Segments, known: Known | None) -> ParameterMode:
         """Return the mode by Gauss-Newton steps that begin at what is known, or if this explains too little, at M."""
-        settings = self.settings
-        if known is None:
-            return ParameterMode.of(self.model, segments, settings)
-        model = self.with_effects(known.effects, segments)
-        begun = np.append(known.parameters, np.zeros(len(model.uncertain) - len(known.parameters)))
-        mode = ParameterMode.of(model, segments, settings, begun)
-        if mode.explains:
+        mode = None if known is None else self.fitted(segments, known.parameters, known.effects)
+        if mode is not None and mode.explains:
             return mode
-        alone = ParameterMode.of(self.model, segments, settings)
-        return min(mode, self.from_mode(alone, known.effects, settings.newton), key=lambda each: each.left)
+        alone = self.fitted(segments, np.zeros(len(self.model.uncertain)))
+        if mode is None or known is None:
+            return alone
+        return min(mode, self.fitted(segments, alone.z, known.effects), key=attrgetter("left"))
 
     def greedily(self, mode: ParameterMode) -> ParameterMode:
         """Return the mode with the effects that make executions clearly more probable, one after the other."""
         settings = self.settings
         while len(_effects(mode.model)) < settings.effects and not mode.explains:
             longer = with_one_more(_effects(mode.model), self.candidates)
-            tried = [self.from_mode(mode, effects, settings.screened) for effects in longer]
+            tried = [self.fitted(mode.segments, mode.z, effects, settings.screened) for effects in longer]
             if not tried:
                 break
-            few = max(tried, key=_height)
+            few = max(tried, key=attrgetter("height"))
             found = ParameterMode.of(few.model, mode.segments, settings, few.z)
             if found.height < mode.height + self.price_of(mode):
                 break
@@ -373,18 +376,14 @@ class _Structures:
                 search = CrossEntropySearch(self.with_effects(effects, segments), segments, settings)
                 searches.append(search.advance(settings.first_rounds, rng))
                 seen.append(kind)
-        plain = searches[0].mode
+        plain = searches[0].refined()
         searches.sort(key=lambda each: -each.height)
-        best = max((each.advance(settings.further_rounds, rng) for each in searches[: settings.starts]), key=_height)
-        mode = best.advance(settings.last_rounds, rng).mode
+        further = [each.advance(settings.further_rounds, rng) for each in searches[: settings.starts]]
+        mode = max(further, key=attrgetter("height")).advance(settings.last_rounds, rng).refined()
         return mode if mode.height > plain.height + self.price_of(plain) else plain
 
     def price_of(self, mode: ParameterMode) -> float:
         return self.settings.price + 0.5 * float(np.log(len(mode.here)))
-
-
-def _height(found: CrossEntropySearch | ParameterMode) -> float:
-    return found.height
 
 
 def _effects(model: UncertainModel) -> tuple[EffectCandidate, ...]:
@@ -419,7 +418,7 @@ def most_probable(
     if affords(sum(rounds) * of_round):
         search = CrossEntropySearch(mode.model, short, settings)
         for each in rounds:
-            found = search.advance(each, rng).mode
+            found = search.advance(each, rng).refined()
             mode = found if found.left < mode.left else mode
             if mode.explains:
                 break

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Rows
+from ctxval._util.arrays import Array
 from ctxval._util.checked import Seconds, require_known
 from ctxval._util.mjcf import Simulator, compile_mjcf, is_mjcf_text, quiet
 from ctxval._util.refusals import require_extra
@@ -116,15 +116,16 @@ class MuJoCo:
             model = copy.copy(self.compiled)
             change(model)
             another._changes = (*self._changes, change)
-            another._simulate_changed(model, np.flatnonzero((model.body_ipos != self.compiled.body_ipos).any(axis=1)))
+            moved = (model.body_ipos != self.compiled.body_ipos).any(axis=1)
+            another._simulate_changed(model, simple=not model.body_simple[moved].any())
         if forces is not None:
             another._forces = forces
         return another
 
-    def _simulate_changed(self, model: Any, moved: Rows) -> None:
-        """Simulate a changed model; bodies whose centres of mass have moved, or shall move, are not simple."""
+    def _simulate_changed(self, model: Any, *, simple: bool) -> None:
+        """Simulate a changed model, in which bodies may be simple if their centres of mass do not move."""
         mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo need")
-        if model.body_simple[moved].any():
+        if not simple:
             _, model = compile_mjcf(self._mjcf, simple=False)
             for change in self._changes:
                 change(model)
@@ -134,10 +135,9 @@ class MuJoCo:
     def _add_uncertain(self, uncertain: Mapping[str, float | str]) -> None:
         self._parameters = (*self._parameters, *uncertain_parameters(self.compiled, uncertain))
         self.uncertain = tuple(each.prior for each in self._parameters)
-        moving = [places[0] for each in self._parameters for field, places in each.places if field == "body_ipos"]
-        bodies = np.unique(np.concatenate([np.ravel(each) for each in moving])) if moving else np.empty(0, np.intp)
-        if self.compiled.body_simple[bodies].any():
-            self._simulate_changed(self.compiled, bodies)
+        moving = (at[0] for each in self._parameters for field, at in each.places if field == "body_ipos")
+        if any(self.compiled.body_simple[bodies].any() for bodies in moving):
+            self._simulate_changed(self.compiled, simple=False)
 
     def with_uncertain(self, uncertain: Mapping[str, float | str]) -> MuJoCo:
         """Return the model with further uncertain parameters, which follow its own."""

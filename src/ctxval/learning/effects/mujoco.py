@@ -14,7 +14,7 @@ from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.uncertain import UncertainParameter
 from ctxval.errors import InputError
-from ctxval.learning.effects.effect import Effect, EffectCandidate, Observed, Parameter, of_ratio, of_size
+from ctxval.learning.effects.effect import Effect, EffectCandidate, Observed, Parameter, Size, of_ratio, of_size
 from ctxval.learning.effects.plant import Joint, Plant, plant_of
 from ctxval.models import MuJoCo
 from ctxval.models.mujoco_parameters import drawn_fields, uncertain_parameters
@@ -123,10 +123,9 @@ class SharedAttribute(OfMuJoCo):
             tilt = Parameter(f"gravity_{axis}", -0.5 * most, 0.5 * most, 0.01 * most, "m/s^2")
             yield of_size(cls((0.0,), f"gravity_{axis}", True), tilt, 0.0)
         for body in _floating(compiled) if joints < 2 else ():  # otherwise, MassCentre is this effect
-            name, extent = compiled.body(body).name, _extent(compiled, body)
             for axis in "xyz":
-                parameter = Parameter("centre of mass", -3 * extent, 3 * extent, 0.05 * extent, "m")
-                yield of_size(cls((0.0,), f"centre_{axis}[{name}]", True), parameter, 0.0)
+                effect = cls((0.0,), f"centre_{axis}[{compiled.body(body).name}]", True)
+                yield of_size(effect, _shift(_extent(compiled, body)), 0.0)
 
     @property
     def unit(self) -> float | str:
@@ -151,8 +150,8 @@ class SharedAttribute(OfMuJoCo):
             slope = np.degrees(np.arctan(size / np.linalg.norm(plant.compiled.opt.gravity)))
             return f"gravity has a part of {size:.3g} m/s^2 along {axis}, as on a slope of {abs(slope):.2g} degrees"
         if self.parameter.startswith("centre"):
-            body = self.parameter.partition("[")[2].rstrip("]")
-            return f"the centre of mass of {body} is shifted by {size:.3g} m along its {self.parameter[7]} axis"
+            quantity, _, body = self.parameter.rstrip("]").partition("[")
+            return _shifted(body, size, quantity[-1])
         if self.added:
             return f"all driven joints stick ({size:.3g} N m)"
         return f"{self.parameter} is {size:.3g} times that of M"
@@ -228,15 +227,14 @@ class MassCentre(OfMuJoCo):
         for body in _heaviest(compiled):
             extent = _extent(compiled, body)
             for axis in range(3 if extent > 0 else 0):
-                shift = Parameter(cls.name, -3 * extent, 3 * extent, 0.05 * extent, "m")
-                yield of_size(cls((0.0,), body, axis), shift, 0.0)
+                yield of_size(cls((0.0,), body, axis), _shift(extent), 0.0)
 
     def change(self, compiled: Any) -> None:
         compiled.body_ipos[self.body, self.axis] += self.sizes[0]
 
     def sentence(self, plant: Plant) -> str:
         name = plant.compiled.body(self.body).name or f"body {self.body}"
-        return f"the centre of mass of {name} is shifted by {self.sizes[0]:.3g} m along its {'xyz'[self.axis]} axis"
+        return _shifted(name, self.sizes[0], "xyz"[self.axis])
 
     def repair(self, plant: Plant) -> dict[str, str]:
         place = np.array(plant.compiled.body_ipos[self.body])
@@ -258,6 +256,14 @@ def _inertias(compiled: Any) -> Array:
 def _extent(compiled: Any, body: int) -> float:
     """Return the largest radius of gyration of a body, metres."""
     return float(np.sqrt(compiled.body_inertia[body].max() / compiled.body_mass[body]))
+
+
+def _shift(extent: float) -> Parameter:
+    return Parameter("centre of mass", -3 * extent, 3 * extent, 0.05 * extent, "m")
+
+
+def _shifted(body: str, size: Size, axis: str) -> str:
+    return f"the centre of mass of {body} is shifted by {size:.3g} m along its {axis} axis"
 
 
 def _floating(compiled: Any) -> list[int]:

@@ -32,7 +32,7 @@ from ctxval.learning.effects.transport import ObservationDelay
 from ctxval.learning.effects.uncertain import UncertainEffects
 from ctxval.learning.extended import estimates_by_loops_on_model
 from ctxval.learning.input_effects import input_candidates
-from ctxval.learning.parameter_posterior import ParameterSettings, most_probable
+from ctxval.learning.parameter_posterior import PRIOR_SEARCH, ParameterSettings, most_probable
 from ctxval.learning.stage_costs import Ledger
 from ctxval.models import MuJoCo
 from ctxval.studies.causes.budget import CauseCosts, CauseSettings, fitting_settings
@@ -313,10 +313,9 @@ class _Study:
         commands, seconds = np.concatenate([run.inputs for run in self.runs]), max(r.times[-1] for r in self.runs)
         late = input_candidates(model, plant.dt, plant.inputs, commands, float(seconds), together=True)
         beside, rng = (*late, *further_attributes(model, self.runs)), np.random.default_rng(0)
-        stage_of = "parameters of M from all of their prior"
         found = most_probable(
             model, self.runs, beside, None, rng, ParameterSettings(),
-            lambda steps: self._affords(stage_of, lambda costs: costs.costs.steps(steps)),
+            lambda steps: self._affords(PRIOR_SEARCH, lambda costs: costs.costs.steps(steps)),
         )  # fmt: skip
         if found is None:
             return None

@@ -121,7 +121,7 @@ def judged_by(experiment: Experiment, distance: UnsafeMargin) -> Experiment:
 
 
 def require_safe_tasks(validation: Validation) -> float:
-    """Return the share of drawn tasks that M satisfies with the margin; an InputError says that there is none.
+    """Return the share of drawn tasks that M satisfies with the margin.
 
     Raises:
         InputError: if no drawn task is safe on the model.
@@ -156,8 +156,6 @@ def assess(
         certificate: the kind and options of the certificate; that of learned dynamics by default.
         tasks: number of tasks on M that the shares are of.
         progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
-
-    An InputError is raised if no drawn task satisfies the specification on M.
 
     Raises:
         InputError: if no drawn task is safe on the model.
